@@ -40,6 +40,12 @@ _UNRESOLVED = ("num_envs", "steps", "threads")
 _WRITTEN = ("suite", "task", "algo", "learner", "num_envs", "steps", "seed")
 """Fields that every ``config.json`` must have."""
 
+STOPPING_EPISODES = 100
+"""Finished episodes of each class before metrics of training end a run early: their means are over about 100 episodes.
+"""
+EPISODES = "Train/episodes"
+"""Tag of the smallest number of finished episodes of a class."""
+
 MAY_CHANGE = {"may_change": True}
 """Metadata of a field that a resumed run may change, because the field does not affect what is learned."""
 
@@ -143,16 +149,17 @@ class RunConfig(Generic[LearnerSettings]):
     suite's classes. If given several times: each class takes the first teacher that knows it."""
     record: Steps = 0
     """Store about this number of training transitions as the data set replay/ in the run's folder, in whole episodes of
-    some of the environments (docs/data.md). 0: none."""
+    some of the environments (docs/data.md). There are more if one environment of each class makes more. 0: none."""
     record_share: tyro.conf.Suppress[tyro.conf.Fixed[NonNegative]] = 0.0
     """``record`` divided by the steps that the run began with. The share is stored so that a run that is resumed for
     more steps records the same environments."""
     stop_at_return: Finite | None = field(default=None, metadata=MAY_CHANGE)
     """End as soon as the mean return reaches this value. It is measured in evaluations if --evaluate-every is given,
-    otherwise in training. None: never."""
+    otherwise in training, after 100 finished episodes of each class. None: never."""
     stop_at_success: Annotated[float, Meta(gt=0.0, le=1.0)] | None = field(default=None, metadata=MAY_CHANGE)
     """Stop as soon as this fraction of episodes succeeds, such as 0.8. It is measured in evaluations if
-    --evaluate-every is given, otherwise in training with exploration noise. None: never."""
+    --evaluate-every is given, otherwise in training with exploration noise, after 100 finished episodes of each class.
+    None: never."""
     stop_at_score: Finite | None = field(default=None, metadata=MAY_CHANGE)
     """Stop as soon as the score in evaluations reaches this value (docs/evaluation.md). Needs --evaluate-every. None:
     never."""
@@ -203,8 +210,18 @@ class RunConfig(Generic[LearnerSettings]):
             if here.get(name) != there.get(name):
                 yield name, here.get(name), there.get(name)
 
+    @property
+    def stops_by_training(self) -> bool:
+        """Return whether metrics of training, not of evaluations, can end the run early."""
+        return self.evaluate_every is None and (self.stop_at_return, self.stop_at_success) != (None, None)
+
     def early_end(self, metrics: Mapping[str, Json]) -> str | None:
-        """Return the tag of the metric that ends the run early, or None if the run continues."""
+        """Return the tag of the metric that ends the run early, or None if the run continues.
+
+        Metrics of training count after ``STOPPING_EPISODES`` episodes. Runs of older versions did not log their number.
+        """
+        if self.stops_by_training and metrics.get(EPISODES, STOPPING_EPISODES) < STOPPING_EPISODES:
+            return None
         if self.evaluate_every is None:
             prefix = "Train"
         else:

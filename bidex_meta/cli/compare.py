@@ -9,7 +9,7 @@ from bidex_meta.cli.parsing import JsonSwitch, RunPaths, parse
 from bidex_meta.cli.plot import named_runs
 from bidex_meta.cli.tables import plain_table, print_table
 from bidex_meta.evaluation.comparison import estimates, read_groups
-from bidex_meta.experiments.comparing import class_table, group_row, group_table
+from bidex_meta.experiments.comparing import class_table, group_row, group_table, setting_lines
 from bidex_meta.runs import plots
 from bidex_meta.runs.provenance import release_of
 from bidex_meta.training.launch import say
@@ -44,4 +44,6 @@ def main(arguments: Sequence[str]) -> None:
         return
     print_table(plain_table(*group_table(groups), spare=("hours", "steps")))
     print_table(plain_table(*class_table(groups)))
+    for line in setting_lines(groups):
+        print(line)
     print("IQM over seeds and classes [95 % bootstrap over seeds]. An interval that holds 0 is no difference.")

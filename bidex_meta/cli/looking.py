@@ -49,9 +49,13 @@ def looked_at(flags: LookFlags, all_slots: bool = False) -> tuple[Worlds, list[s
     """
     if flags.object is not None and (flags.suite is not None or flags.task is None):
         raise BidexError("--object goes with --task alone: bidex-meta render --task CatchUnderarm --object mug ...")
-    config = WorldsConfig(suite=flags.suite, task=flags.task, object=flags.object, threads=1, seed=flags.seed)
+    config = WorldsConfig(suite=flags.suite, task=flags.task, object=flags.object, threads=1, seed=flags.seed or 0)
     if flags.actor not in ("zero", "random"):
         run = RunFolder.open(Path(flags.actor)).config()
+        if flags.suite is None:
+            config = replace(config, tasks_per_class=run.tasks_per_class)
+        if flags.seed is None:
+            config = replace(config, seed=run.seed, task_seed=run.task_seed)
         config = replace(config, suite=config.suite or run.suite, task=config.task or run.task)
         config = replace(config, base=run.base, points=run.points, touch=run.touch)
         if not flags.task and not flags.object:

@@ -19,7 +19,7 @@ import tyro
 from bidex_meta.config import Switch
 from bidex_meta.errors import BidexError
 from bidex_meta.utils.streams import output_width
-from bidex_meta.utils.validation import Seed, check_fields
+from bidex_meta.utils.validation import Seed, check_fields, refuse_unused
 
 Options = TypeVar("Options")
 
@@ -82,7 +82,15 @@ class LookFlags:
     suite: str | None = None
     """Show the task with the rules and tasks of this suite. None: those of the run; without a run, those of the class
     itself."""
-    seed: Seed = 0  # Seed that draws tasks and start states.
+    seed: Seed | None = None
+    """Seed that draws tasks and start states. None: that of the run, which draws the tasks of its training; 0 without a
+    run."""
+
+    def __post_init__(self) -> None:
+        if self.run is not None:
+            refuse_unused(self, ("policy",), "with a run folder, which is the policy")
+        elif self.policy in ("zero", "random"):
+            refuse_unused(self, ("checkpoint",), "without a run")
 
     @property
     def actor(self) -> str:

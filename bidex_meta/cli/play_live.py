@@ -45,8 +45,8 @@ def main(arguments: Sequence[str]) -> None:
 
     source, slots, task = looked_at(flags)
     world: Any = source.world("train", len(slots))
-    agent = acting(flags.actor, world, flags.seed, flags.checkpoint)
-    stage = Stage(world, agent, slots.index(task), flags.seed, tour)
+    agent = acting(flags.actor, world, source.seed, flags.checkpoint)
+    stage = Stage(world, agent, slots.index(task), source.seed, tour)
     screen = _screen(flags, stage)
     note("")  # the moving picture on the screen shows that the command works
     with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C ends the view in the browser

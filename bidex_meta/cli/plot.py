@@ -16,7 +16,7 @@ from bidex_meta.runs.stored import StoredRun, open_runs
 
 @dataclass(frozen=True)
 class PlotFlags:
-    """Draw return and success of every task against environment steps, or against shots of adaptation.
+    """Draw return and success of every task against training steps, or against shots of adaptation.
 
     Example: bidex-meta plot runs/MT4/mtppo/* --out curves.png
 
@@ -52,7 +52,7 @@ def main(arguments: Sequence[str]) -> None:
         else:
             source = flags.evaluation
             evaluation = read_evaluation(source, f"bidex-meta evaluate {run.path} --shots 3 --json > {source}")
-        plots.save(plots.draw_adaptation(evaluation, source), out)
+        plots.save(plots.draw_adaptation(evaluation, source, run.goal), out)
     print(out)
 
 

@@ -16,6 +16,7 @@ from bidex_meta.experiments.hub import (
     FOLDER,
     OF_A_RUN,
     OF_DATA,
+    ONNX,
     called,
     checked,
     copied,
@@ -52,10 +53,17 @@ def main(arguments: Sequence[str]) -> None:
     found = checked(flags.run)
     if not of_data and not any(name.endswith(".pt") for name in files):
         raise BidexError(f"{flags.run} has no checkpoint, so there is no policy to publish. Continue its training.")
+    name = flags.name
+    if name.startswith(FOLDER):
+        name = FOLDER + absolute(name.removeprefix(FOLDER)).name  # cards hold no path of this machine
     if isinstance(found, RunFolder):
-        card = run_card(found, flags.name)
+        if ONNX in files:
+            from bidex_meta.experiments.exporting import check_export
+
+            check_export(found, files[ONNX])
+        card = run_card(found, name)
     else:
-        card = data_card(found, flags.name)
+        card = data_card(found, name)
     content = published(flags.run, files) | {CARD: card.encode()}
     if flags.name.startswith(FOLDER):
         with new_folder(absolute(flags.name.removeprefix(FOLDER))) as target:

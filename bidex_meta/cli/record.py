@@ -16,7 +16,7 @@ class RecordFlags(RecordConfig):
     If the command is killed or interrupted, run it again: it continues and ends with the same data.
     """
 
-    estimate: Switch = False  # Print how much time and disk space the recording would take, then exit.
+    estimate: Switch = False  # Print the maximum disk space and memory that the recording takes, then exit.
 
 
 def main(arguments: Sequence[str]) -> None:

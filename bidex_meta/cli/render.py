@@ -1,7 +1,7 @@
 """``bidex-meta render``: draw a picture of a task, or a film of a policy."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from bidex_meta.cli.parsing import LookFlags, Switch, parse
@@ -10,7 +10,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.runs import video
 from bidex_meta.runs.atomic import check_writable, refuse_links
 from bidex_meta.utils.plugins import short_name
-from bidex_meta.utils.validation import Few, Pixels
+from bidex_meta.utils.validation import Few, Pixels, refuse_unused
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,13 @@ class RenderFlags(LookFlags):
     """Next to each picture, draw the point cloud of the class's depth camera, from the camera and from the side. The
     cloud has the same number of points as the run's observations, otherwise 768."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.tiled:
+            refuse_unused(self, ("large",), "without --tiled")
+        elif self.suite or self.actor not in ("zero", "random"):
+            refuse_unused(self, ("task",), "with --tiled, which shows all classes")
+
 
 def main(arguments: Sequence[str]) -> None:
     """Render a picture or a film, and print the path of the file."""
@@ -52,18 +59,18 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.cli.looking import acting, looked_at
     from bidex_meta.experiments.films import Film
 
-    names = (field.name for field in fields(Film) if field.name != "out")
+    names = (field.name for field in fields(Film) if field.name not in ("out", "seed"))
     film = Film(out, **{name: getattr(flags, name) for name in names})
     film.check()
     source, slots, task = looked_at(flags, all_slots=flags.tiled)
     # One environment per slot is enough, because each slot is shown once.
     world = source.world("train", len(slots))
-    agent = acting(flags.actor, world, flags.seed, flags.checkpoint)
+    agent = acting(flags.actor, world, source.seed, flags.checkpoint)
     if flags.tiled:
         rows = list(range(len(slots)))
     else:
         rows = [world.slot_env_ids[slots.index(task)].start]
-    film.write(agent, world, rows)
+    replace(film, seed=source.seed).write(agent, world, rows)
     world.close()
     print(out)
 

@@ -7,7 +7,7 @@ from bidex_meta.cli.run_flags import RunFlags, run_flags
 from bidex_meta.cli.tables import print_evaluation, print_meta_test
 from bidex_meta.config import printed
 from bidex_meta.experiments.evaluating import RunMetaTest
-from bidex_meta.experiments.run_config import check, check_resumed
+from bidex_meta.experiments.run_config import check, resumed
 from bidex_meta.experiments.training import Stopped, train
 from bidex_meta.runs import RunFolder
 from bidex_meta.training import distributed
@@ -49,7 +49,7 @@ def _check_printed(flags: RunFlags) -> None:
     """Raise BidexError for a config that ``train`` would refuse. The memory of this machine is not checked."""
     check(flags.config, with_memory=False)
     if flags.resume is not None:
-        check_resumed(RunFolder.open(flags.resume), flags.config)
+        resumed(RunFolder.open(flags.resume), flags.config)
 
 
 def _evaluate(flags: RunFlags, folder: RunFolder) -> None:

@@ -50,6 +50,7 @@ def main(arguments: Sequence[str]) -> None:
         else:
             end = ": this run is not what its evaluation says"
         print(f"{len(found.classes)} classes: {verdict}{end}")
+        print(f"Not verified: {', '.join(found.unverified)}.")
     if not found.agrees:
         raise SystemExit(EXIT_FAILED)
 

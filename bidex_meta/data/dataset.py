@@ -60,6 +60,7 @@ class _Collected:
     task: Text | None = None
     object: Text | None = None
     points: Whole | None = None
+    tasks_per_class: Whole | None = None
     seed: Seed | None = None
     observation_groups: list[tuple[str, Annotated[list[_Range], Meta(min_length=1)]]] = field(default_factory=list)
 

@@ -13,8 +13,9 @@ from bidex_meta.runs.evaluations import ClassSummary, Interval
 EQUAL = "equal"
 WITHIN = "within"
 DIFFERS = "differs"
-_BITS = ("success", "mean_return", "length", "episodes", "tasks", "unstable", "solved")
-_MEASURES = 2  # success and return
+_RATES = ("success", "success_once", "success_at_end")
+_BITS = (*_RATES, "mean_return", "score", "length", "episodes", "tasks", "unstable", "solved")
+_MEASURES = 2  # success and return; the limits of the other rates are too wide to be exceeded by chance
 
 
 @dataclass(frozen=True)
@@ -23,8 +24,8 @@ class Agreement:
 
     name: str  # name of the class; for a meta-test, with split and shot
     outcome: str
-    """``equal``: bit for bit; ``within``: success and return differ no more than their intervals allow; ``differs``:
-    otherwise."""
+    """``equal``: bit for bit; ``within``: rates of success and the return differ no more than their intervals allow, or
+    the score alone differs, whose references may have changed; ``differs``: otherwise."""
     recorded: ClassSummary
     again: ClassSummary
 
@@ -34,6 +35,7 @@ class Agreement:
             "outcome": self.outcome,
             "success": [self.recorded.success, self.again.success],
             "return": [self.recorded.mean_return, self.again.mean_return],
+            "score": [self.recorded.score, self.again.score],
         }
 
 
@@ -65,11 +67,16 @@ def _outcome(recorded: ClassSummary, again: ClassSummary, wider: float) -> str:
     else:
         count = again.episodes or 1
     # The interval of a success rate follows from the rate. The limit is 1.5 times as wide.
-    deviation = math.sqrt(max(recorded.success * (1 - recorded.success), 0.0) / count)
-    half = min(_half(recorded.success_interval), 1.5 * 1.96 * deviation)
+    half = min(_half(recorded.success_interval), 1.5 * _half_of_rate(recorded.success, count))
     gap = abs(recorded.success - again.success)
     if gap > _rounding(recorded.success) + wider * math.hypot(_half(again.success_interval), half):
         return DIFFERS
+    for then, now in ((recorded.success_once, again.success_once), (recorded.success_at_end, again.success_at_end)):
+        if then is None or now is None:
+            continue
+        half = math.hypot(_half_of_rate(then, count), _half_of_rate(now, count))
+        if abs(then - now) > _rounding(then) + wider * 1.5 * half:
+            return DIFFERS
     from scipy.stats import f  # not at the top of the module, because the import takes half a second
 
     # We assume that recorded returns have the same spread as the returns played now. The recorded interval is wider by
@@ -82,6 +89,11 @@ def _outcome(recorded: ClassSummary, again: ClassSummary, wider: float) -> str:
     if gap > _rounding(recorded.mean_return) + wider * math.hypot(own, half):
         return DIFFERS
     return WITHIN
+
+
+def _half_of_rate(rate: float, count: int) -> float:
+    """Return half the width of the 95 % interval of a rate over ``count`` episodes or tasks."""
+    return 1.96 * math.sqrt(max(rate * (1 - rate), 0.0) / count)
 
 
 def _rounding(value: float) -> float:

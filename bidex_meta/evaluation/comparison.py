@@ -4,16 +4,22 @@ import json
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.references import rescored
+from bidex_meta.evaluation.references import rescored, version_of
 from bidex_meta.evaluation.statistics import Estimate, Interval, bootstrap_band, iqm_difference, iqm_over_seeds
 from bidex_meta.runs.atomic import Json
-from bidex_meta.runs.evaluations import ClassSummary, Evaluated, MetaTestEvaluation, PolicyEvaluation
+from bidex_meta.runs.evaluations import (
+    ClassSummary,
+    Evaluated,
+    MetaTestEvaluation,
+    PolicyEvaluation,
+    unusual_settings,
+)
 from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.runs.metrics import training_seconds
 from bidex_meta.runs.plots import Curve
@@ -43,6 +49,7 @@ class Group:
     scores: np.ndarray | None  # score, (seeds, classes); None if a class has no reference
     steps: int  # environment steps, summed over the runs of a seed, then averaged over seeds
     version: int  # 2: rules of version 2, whose success and score mean something else than version 1's
+    settings: list[str]  # split and randomisation of the evaluations, if they are not the usual ones
     steps_range: tuple[int, int]  # smallest and largest number of steps of a seed
     hours: float  # hours of training without evaluation, summed and averaged like ``steps``
     paths: list[Path]  # the runs' folders, or JSON files
@@ -153,12 +160,16 @@ def _differing_settings(kind: Json, kinds: Iterable[Json]) -> str:
 
 
 def _check_copies(runs: Sequence[Run]) -> None:
-    """Raise BidexError if one run is a copy of another, that is, if the times in their metrics are equal."""
-    known: dict[tuple[float, ...], Path] = {}
+    """Raise BidexError if one run is a copy of another, or of its beginning: the times in their metrics are equal."""
+    known = []
     for run in runs:
-        times = tuple(row["time"] for row in run.metrics() if row.get("time") is not None)
-        if len({*times}) > 1 and known.setdefault(times, run.path) != run.path:
-            raise BidexError(f"{run.path} is a copy of {known[times]}: a run counts as one seed. Name it once.")
+        times = [row["time"] for row in run.metrics() if row.get("time") is not None]
+        if len({*times}) > 1:
+            known.append((times, run.path))
+    # After sorting, a list of times comes directly before those that begin with it.
+    for (first, original), (second, path) in pairwise(sorted(known)):
+        if second[: len(first)] == first and path != original:
+            raise BidexError(f"{path} is a copy of {original}: a run counts as one seed. Name it once.")
 
 
 def estimates(groups: Sequence[Group]) -> dict[str, list[tuple[str, float, Interval | None]]]:
@@ -252,13 +263,11 @@ def group_of(label: str, runs: Sequence[Run]) -> Group:
         return np.array(rows, dtype=float)
 
     scores = table("score")
-    # Only results of version 2 store the length of a full episode.
-    all_rows = chain.from_iterable(rows.values() for rows in by_seed.values())
-    version = 1 + any(row.episode_steps is not None for row in all_rows)
     return Group(
         label=label, seeds=seeds, classes=classes, success=table("success"), returns=table("mean_return"),
         scores=None if np.isnan(scores).any() else scores, steps=round(sum(steps.values()) / len(steps)),
-        steps_range=(min(steps.values()), max(steps.values())), version=version,
+        steps_range=(min(steps.values()), max(steps.values())), version=version_of(runs[0].config(), by_seed[seeds[0]]),
+        settings=unusual_settings(runs[0].evaluation()),
         hours=float(np.mean([seconds[seed] for seed in seeds])) / 3600.0, paths=[run.path for run in runs],
     )  # fmt: skip
 
@@ -275,13 +284,27 @@ class History:
 def read_histories(runs: Sequence[Run]) -> list[History]:
     """Group runs that differ only in the seed, and return the training curves of each group.
 
-    The runs need not be evaluated. Raises BidexError if no run has metrics.
+    The runs need not be evaluated. Raises BidexError if no run has metrics, or if two runs of a group have the same
+    seed and class.
     """
     groups = _by_kind([run_kind(run.config()) for run in runs], runs)
+    for label, members in groups:
+        _check_seeds(label, members)
     histories = [History(label, members, curves_of(members)) for label, members in groups]
     if not any(history.curves for history in histories):
         raise BidexError(f"{runs[0].path} has no metrics to draw yet. Let the run continue.")
     return histories
+
+
+def _check_seeds(label: str, runs: Sequence[Run]) -> None:
+    """Raise BidexError if two runs of a group have the same seed and class, because they would count as two seeds."""
+    known = set()
+    for run in runs:
+        config = run.config()
+        if (config.seed, config.task) in known:
+            subject = config.task or config.suite
+            raise BidexError(f"{run.path} is the second run of {label} with seed {config.seed} on {subject}.")
+        known.add((config.seed, config.task))
 
 
 def curves_of(runs: Sequence[Run]) -> dict[str, Curve]:

@@ -9,6 +9,7 @@ from typing_extensions import Unpack
 
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.play import agent_step
 from bidex_meta.runs.video import LABEL, tiled
 from bidex_meta.world.cloud import Camera, Cloud, beside, camera_of, draw
 from bidex_meta.world.contract import PooledWorld
@@ -44,12 +45,14 @@ def film_row(
     """
     drawn = cast(RenderedWorld, world)
     obs, _ = world.reset(seed=seed)
-    agent.reset(obs.new_ones(len(obs), dtype=torch.bool))
+    running = obs.new_ones(len(obs), dtype=torch.bool)
+    agent.reset(running)
     for step in range(steps):
         if every is not None and step % every == 0:
             yield drawn.render(env_id=row, **look)
-        obs, _, terminated, truncated, _ = world.step(agent.eval_action(obs))
-        if bool(terminated[row] | truncated[row]):
+        obs, _, terminated, truncated, _ = agent_step(agent, world, obs, running)
+        running = running & ~(terminated | truncated)
+        if not bool(running[row]):
             break
     yield drawn.render(env_id=row, **look)
 
@@ -89,7 +92,7 @@ def film_tiles(
             yield frame
         if step == steps:
             return
-        obs, _, terminated, truncated, info = world.step(agent.eval_action(obs))
+        obs, _, terminated, truncated, info = agent_step(agent, world, obs, began)
         solved = info["running"]["success"]
         ended = terminated | truncated
         if bool(ended.any()):

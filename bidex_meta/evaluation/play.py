@@ -6,7 +6,7 @@ both measures are reported. The return of an episode is the sum of its unscaled 
 is a failure. It counts with the return of random actions, or with its own return if that is lower.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.maths import check_precision
 from bidex_meta.utils.validation import Seed
 from bidex_meta.utils.waiting import note
-from bidex_meta.world.contract import TaskWorld
+from bidex_meta.world.contract import Step, TaskWorld, VectorWorld
 
 DEFAULT = Protocol()
 Episodes = dict[str, np.ndarray]  # Results of episodes by name, one entry per episode; see :func:`play_tasks`.
@@ -76,15 +76,11 @@ def play_tasks(
     tasks = world.task_index.clone()
     remaining = quota(world, episodes_per_task)
     rounds: list[dict[str, torch.Tensor]] = []
-    if hidden_rewards:
-        observe = None
-    else:
-        observe = getattr(agent, "observe", None)
     while bool((playing := remaining > 0).any()):
         if rounds:
             obs, _ = world.reset(options={"reset_mask": playing})
         agent.reset(playing)
-        rounds.append({"row": torch.nonzero(playing).squeeze(1), **_play(agent, world, obs, playing, observe)})
+        rounds.append({"row": torch.nonzero(playing).squeeze(1), **_play(agent, world, obs, playing, hidden_rewards)})
         remaining -= playing.long()
     episodes = {key: torch.cat([played[key] for played in rounds]).cpu().numpy() for key in rounds[0]}
     row = episodes.pop("row")
@@ -134,11 +130,7 @@ def quota(world: TaskWorld, episodes_per_task: int) -> torch.Tensor:
 
 @torch.no_grad()
 def _play(
-    agent: Agent,
-    world: TaskWorld,
-    obs: torch.Tensor,
-    playing: torch.Tensor,
-    observe: Callable[[Timestep], None] | None,
+    agent: Agent, world: TaskWorld, obs: torch.Tensor, playing: torch.Tensor, hidden_rewards: bool
 ) -> dict[str, torch.Tensor]:
     """Play an episode in each environment of ``playing``; return the results in the form of ``play_tasks``."""
     running = playing.clone()
@@ -149,13 +141,7 @@ def _play(
     longest = int(world.max_episode_steps.max())
     for step in range(longest):
         note("Playing episodes to evaluate", f"step {step} of {longest}")
-        action = agent.eval_action(obs)
-        new, reward, terminated, truncated, info = world.step(action)
-        if observe is not None:
-            valid = running & ~info["unstable"]
-            action = torch.as_tensor(action, device=obs.device)
-            observe(Timestep(obs, action, reward, terminated, truncated, {}, new, valid))
-        obs = new
+        obs, _, terminated, truncated, info = agent_step(agent, world, obs, running, hidden_rewards)
         gained = info["reward_unscaled"].double()
         returns += torch.where(running, gained, torch.zeros_like(gained))
         lengths += running
@@ -172,6 +158,25 @@ def _play(
     played = {"return": returns, "success": success, "length": lengths, "unstable": unstable}
     played |= {"once": once, "at_end": held >= HELD_STEPS}
     return {key: value[playing] for key, value in played.items()}
+
+
+def agent_step(
+    agent: Agent, world: VectorWorld, obs: torch.Tensor, running: torch.Tensor, hidden_rewards: bool = False
+) -> Step:
+    """Take a step with the agent's action for ``obs``, and return the result of the world's ``step``.
+
+    If the agent has a method ``observe``, it receives the transition, unless ``hidden_rewards`` is set. Environments
+    outside ``running``, bool (num_envs,), and those whose physics broke, are not valid in this transition.
+    """
+    action = agent.eval_action(obs)
+    outcome = world.step(action)
+    observe = getattr(agent, "observe", None)
+    if observe is not None and not hidden_rewards:
+        new, reward, terminated, truncated, info = outcome
+        valid = running & ~info["unstable"]
+        action = torch.as_tensor(action, device=obs.device)
+        observe(Timestep(obs, action, reward, terminated, truncated, {}, new, valid))
+    return outcome
 
 
 class ZeroAgent:

@@ -8,6 +8,7 @@ others. In version 2 the reward of a step is in [0, 1], so the score needs no re
 """
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypedDict
@@ -16,10 +17,11 @@ import msgspec
 import numpy as np
 
 from bidex_meta.errors import BidexError
-from bidex_meta.rules import V2, versioned_name
+from bidex_meta.rules import V2, plain_name, versioned_name
 from bidex_meta.runs.atomic import Json, write_json
 from bidex_meta.runs.evaluations import ClassSummary
 from bidex_meta.runs.folder import AnyConfig
+from bidex_meta.suite_files import load_suite
 from bidex_meta.utils import paths
 from bidex_meta.utils.files import exists, read_json
 from bidex_meta.utils.validation import Finite, parse
@@ -171,11 +173,28 @@ def rescored(classes: dict[str, ClassSummary], config: AnyConfig) -> dict[str, C
     References hold only for moving hand bases. The bases are known to have moved if the run's config says so, or if any
     class has a score already. Otherwise all results are returned unchanged.
     """
+    if version_of(config, classes) == 2:
+        return classes
     if config.base != "moving" and all(row.score is None for row in classes.values()):
         return classes
     known = references()
     rows = dict(classes)
-    for name in [name for name, row in classes.items() if name in known and row.episode_steps is None]:
+    for name in [name for name in classes if name in known]:
         scores = known[name].scores(np.array([classes[name].mean_return]))
         rows[name] = msgspec.structs.replace(classes[name], score=None if scores is None else float(scores[0]))
     return rows
+
+
+def version_of(config: AnyConfig, classes: Mapping[str, ClassSummary]) -> int:
+    """Return 2 if a run has the reward of version 2, whose success and score mean something else; otherwise 1.
+
+    The name of the run's suite or class decides. A suite without a file here has version 2 if its results have
+    ``episode_steps``.
+    """
+    is_second = any(row.episode_steps is not None for row in classes.values())
+    if config.suite is None:
+        is_second |= config.task != plain_name(config.task or "")
+    else:
+        with suppress(BidexError):  # suites of Meta-World have no file, and the user's may be missing
+            is_second |= load_suite(config.suite).rules.reward == "v2"
+    return 1 + is_second

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.evaluation import references
+from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED
 from bidex_meta.evaluation.play import RandomAgent, ZeroAgent, evaluate
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.rules import V2, versioned_name
@@ -64,7 +65,7 @@ def baseline(
     if out is not None and worlds.suite is not None and any(entry.tasks for entry in worlds.suite.classes):
         raise BidexError(f"References are for drawn tasks, but {suite} lists tasks. Leave --out away.")
     if policy == "script":
-        found = _scripted(worlds, episodes)
+        found = _scripted(worlds, episodes, EVALUATION_SEED + seed)
     else:
         found = _played(policy, worlds, episodes, seed)
     if out is not None:
@@ -86,12 +87,12 @@ def _played(policy: str, worlds: Worlds, episodes: int, seed: int) -> Evaluation
         witnesses = {name: load_witness(name) for name in names if witness_path(name).is_file()}
         agent = OpenLoopReplay(witnesses, list(names), world.task_id, world.single_action_space.shape[0])
         names = list(witnesses)
-    found = evaluate(agent, world, episodes, references=_without_returns(worlds))
+    found = evaluate(agent, world, episodes, seed=EVALUATION_SEED + seed, references=_without_returns(worlds))
     world.close()
     return replace(found, classes={name: found.classes[name] for name in names})
 
 
-def _scripted(worlds: Worlds, episodes: int) -> Evaluation:
+def _scripted(worlds: Worlds, episodes: int, seed: int) -> Evaluation:
     """Evaluate the scripted policy of each class that has one; other classes are left out of the result."""
     scripts = scripts_of(next(iter(worlds.task_classes().values())).rules)
     names = [name for name in worlds.task_classes() if name in scripts]
@@ -99,7 +100,7 @@ def _scripted(worlds: Worlds, episodes: int) -> Evaluation:
         raise BidexError(f"Expected a suite with a class that has a script ({', '.join(scripts)}), got {worlds.name}.")
     world = worlds.world()
     assert isinstance(world, World)
-    found = evaluate(Scripted(world, names=names), world, episodes, references=_without_returns(worlds))
+    found = evaluate(Scripted(world, names=names), world, episodes, seed=seed, references=_without_returns(worlds))
     world.close()
     return replace(found, classes={name: found.classes[name] for name in names})
 

@@ -10,7 +10,7 @@ from bidex_meta.data import Dataset
 from bidex_meta.errors import one_line
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import Json
-from bidex_meta.runs.evaluations import ClassSummary, PolicyEvaluation
+from bidex_meta.runs.evaluations import ClassSummary, PolicyEvaluation, unusual_settings
 from bidex_meta.runs.provenance import versions_of
 from bidex_meta.runs.versions import Versions, parse_versions
 from bidex_meta.utils.files import portable
@@ -24,27 +24,38 @@ def run_card(folder: RunFolder, name: str) -> str:
     config = folder.config()
     versions = versions_of(folder)
     subject = portable(config.suite or str(config.task))
-    classes = _classes(folder)
+    loaded = folder.checkpoints.load()
+    steps = loaded[1] if loaded else 0
+    evaluation = folder.evaluation() if folder.evaluated else None
+    classes: dict[str, ClassSummary] = {}
+    results = ""
+    played = subject
+    if isinstance(evaluation, PolicyEvaluation) and evaluation.steps != steps:
+        results = "\nThe results are left out, because evaluation.json is not of the newest checkpoint.\n"
+    elif isinstance(evaluation, PolicyEvaluation):
+        classes = evaluation.policy.classes
+        played = ", ".join([subject, *unusual_settings(evaluation)])
+        results = f"\nResults of the policy of {steps:,} steps on {played}:\n{_table(classes)}"
     mean = sum(row.success for row in classes.values()) / max(len(classes), 1)
     found = [{"type": "success rate", "value": round(mean, 4), "name": "mean over classes"}]
     header = {
         "library_name": "bidex-meta", "license": "apache-2.0", "pipeline_tag": "reinforcement-learning",
         "tags": ["reinforcement-learning", "bidex-meta", "mujoco", subject, config.algo],
         "model-index": [{"name": name, "results": [{
-            "task": {"type": "reinforcement-learning"}, "dataset": {"name": subject, "type": subject}, "metrics": found,
+            "task": {"type": "reinforcement-learning"}, "dataset": {"name": played, "type": subject}, "metrics": found,
         }]}],
     }  # fmt: skip
     if not classes:
         del header["model-index"]
     facts = {
         "suite or class": subject, "algorithm": config.algo, "preset": config.preset, "all settings": "config.json",
-        "seed": config.seed, "steps": f"{folder.checkpoints.newest_step() or 0:,}", **_made(versions),
+        "seed": config.seed, "steps": f"{steps:,}", **_made(versions),
     }  # fmt: skip
     if episodes := [row.episodes for row in classes.values() if row.episodes]:
         facts["evaluated on"] = f"{max(episodes)} episodes of a class"
     title = f"{config.algo} on {subject}, seed {config.seed}"
     plays = f"bidex-meta pull {name} --out policy\nbidex-meta evaluate policy"
-    return _card(header, title, plays, facts) + _table(classes)
+    return _card(header, title, plays, facts) + results
 
 
 def data_card(dataset: Dataset, name: str) -> str:
@@ -90,18 +101,8 @@ def _cell(value: object) -> str:
     return one_line(value).replace("|", "\\|")
 
 
-def _classes(folder: RunFolder) -> dict[str, ClassSummary]:
-    """Return the results of a policy that does not adapt; empty if there are none."""
-    evaluation = folder.evaluation() if folder.evaluated else None
-    if isinstance(evaluation, PolicyEvaluation):
-        return evaluation.policy.classes
-    return {}
-
-
 def _table(classes: dict[str, ClassSummary]) -> str:
     lines = []
     for name, row in classes.items():
         lines.append(f"| {_cell(name)} | {100 * row.success:.1f} % | {row.mean_return:.4g} |")
-    if lines:
-        return "\n".join(["", "| class | success | return |", "|---|---|---|", *lines, ""])
-    return ""
+    return "\n".join(["", "| class | success | return |", "|---|---|---|", *lines, ""])

@@ -17,7 +17,7 @@ def group_row(group: Group, first: Group) -> Json:
     """
     row: Json = {
         "group": group.label, "seeds": group.seeds, "steps": group.steps, "steps_range": list(group.steps_range),
-        "hours": round(group.hours, 3),
+        "hours": round(group.hours, 3), "settings": group.settings,
     }  # fmt: skip
     measures = ("success", group.success, success_over(group, first)), ("score", group.scores, score_over(group, first))
     for name, own, over in measures:
@@ -44,6 +44,11 @@ def group_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
         seeds = f"{len(group.seeds)} ({', '.join(map(str, group.seeds))})"
         rows.append([group.label, seeds, group.steps_text(), f"{group.hours:.2f}", *cells])
     return [*columns, "success over the first", "score over the first"], rows
+
+
+def setting_lines(groups: Sequence[Group]) -> list[str]:
+    """Return a line for each group whose evaluations have another split than ``train``, or were randomised."""
+    return [f"Evaluation of {each.label}: {', '.join(each.settings)}." for each in groups if each.settings]
 
 
 def class_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:

@@ -109,6 +109,23 @@ def exported(policy: Any, shape: Json, metadata: dict[str, str]) -> tuple[bytes,
     return content, gap, float(abs(actions - as_played).max())
 
 
+def check_export(folder: RunFolder, path: Path) -> None:
+    """Raise BidexError unless an ONNX file can be read and its policy has the steps of a run's newest checkpoint."""
+    mend = f"Write it again: bidex-meta export {folder.path}, or delete it."
+    try:
+        import onnxruntime
+    except ImportError:
+        raise BidexError(f"{path} is read by onnxruntime: pip install 'bidex-meta[export]'. Or delete it.") from None
+    try:
+        session = onnxruntime.InferenceSession(path.read_bytes(), providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime raises many kinds of errors
+        raise BidexError(f"{path}: expected an ONNX file, got {one_line(error)[:100]}. {mend}") from None
+    exported_steps = session.get_modelmeta().custom_metadata_map.get("steps")
+    _, steps = load_checkpoint(folder)
+    if exported_steps != str(steps):
+        raise BidexError(f"{path}: expected the newest policy, of {steps} steps, got {exported_steps} steps. {mend}")
+
+
 def _onnx(policy: Any, obs: torch.Tensor, metadata: dict[str, str]) -> bytes:
     class MeanAction(torch.nn.Module):
         def __init__(self) -> None:

@@ -22,7 +22,8 @@ FOLDER = "folder:"
 """Prefix of a name that is a folder of this machine, not a repository of the Hugging Face Hub."""
 DATASETS = "datasets/"
 """Prefix of the name of a data set's repository, as in the hub's addresses."""
-OF_A_RUN = ("config.json", "versions.json", "evaluation.json", "metrics.jsonl", "policy.onnx", "checkpoints/*.pt")
+ONNX = "policy.onnx"
+OF_A_RUN = ("config.json", "versions.json", "evaluation.json", "metrics.jsonl", ONNX, "checkpoints/*.pt")
 OF_DATA = ("data/metadata.json", "data/*.hdf5")
 SUITES = "*.toml"
 """Pattern of users' own suite files; such a file is published with the run that was trained on the suite."""

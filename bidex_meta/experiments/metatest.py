@@ -23,7 +23,7 @@ TASKS = 5  # default tasks of each class, the first of its pool: all of ML1's, a
 # default episodes of a task in a shot, if the config sets no number; the largest number taken from a config
 _ROLLOUTS = 10
 _MOST_ROLLOUTS = 40
-_ENVIRONMENTS = 1024  # default maximum of environments stepped together; the world needs half a GB
+ENVIRONMENTS = 1024  # default maximum of environments stepped together; the world needs half a GB
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +105,7 @@ def meta_test(
             source = worlds
         part = "train" if split == OTHERS else split
         counts = [len(pool) for pool in source.tasks(part).values()]
-        limit = options.num_envs or _ENVIRONMENTS
+        limit = options.num_envs or ENVIRONMENTS
         protocol = _protocol(adaptation, options, split, counts, limit)
         rollouts = protocol.rollouts or 1
         num_envs = environments_for(len(counts), (protocol.tasks or 1) * protocol.trials, rollouts, limit)

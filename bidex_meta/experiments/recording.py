@@ -36,7 +36,7 @@ from bidex_meta.training.learner import Capability
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import absolute
 from bidex_meta.utils.memory import usable_cores
-from bidex_meta.utils.validation import Environments, Seed, Threads, check_fields
+from bidex_meta.utils.validation import Environments, Seed, Threads, check_fields, refuse_unused
 from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted, ShiftedStarts
 from bidex_meta.witness.scripts import script_of
 from bidex_meta.witness.store import load_witness
@@ -46,12 +46,22 @@ from bidex_meta.worlds import Worlds, open_worlds
 
 RUNS = {"random": 0, "medium": 1, "expert": 1, "medium-expert": 2, "replay": 1, "demonstrations": 0}
 """Kinds of data sets, and the number of runs that each kind takes."""
+_UNUSED = {
+    "random": ("checkpoint", "actions", "noise", "starts", "shift"),
+    "replay": (
+        "checkpoint", "actions", "noise", "starts", "shift", "size", "seed", "num_envs", "device", "engine", "threads",
+    ),
+    "demonstrations": ("checkpoint", "actions"),
+}  # fmt: skip
+"""Settings that have no effect in a kind of data set; in kinds with policies of runs these are those of demonstrations.
+"""
 SIZE = {"medium-expert": 2_000_000, "demonstrations": 20_000}
 _USUAL_SIZE = 1_000_000
 _DEMONSTRATORS = {"witness": 32, "tasks": 200}  # default number of environments for demonstrations, by ``starts``
 _MOST_HELD = 1_200_000_000  # maximum number of bytes of running episodes, without the world
 _PATIENCE = 3  # maximum number of rounds without a successful demonstration
-_OF_RUN = {"suite": None, "task": None, "base": "own", "object": None, "points": 0, "touch": False, "seed": None}
+_OF_RUN = dict.fromkeys(("suite", "task", "object", "seed", "tasks_per_class"))
+_OF_RUN |= {"base": "own", "points": 0, "touch": False}
 """Entries of a run's config that decide which tasks are played."""
 
 
@@ -76,8 +86,8 @@ class RecordConfig:
     actions: Literal["sampled", "mean"] = "sampled"
     """sampled: drawn from the policy's distribution, if the policy has one; mean: the policy's mean action."""
     noise: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
-    """Standard deviation of the Gaussian noise added to the actions of a witness, or of a policy without a
-    distribution."""
+    """Standard deviation of the Gaussian noise added to the actions of a policy, witness or script. Sampled actions
+    already vary and get this noise too."""
     starts: Literal["witness", "tasks"] = "witness"
     """With demonstrations: the starts of the replays. witness: replay the witness in its own task, from its own start
     with shifted objects. tasks: replay it in all tasks of the class, from their starts; it succeeds less often, but the
@@ -173,6 +183,9 @@ def _check(settings: RecordConfig, kind: str) -> None:
         raise BidexError(f"record {kind} plays what its run was trained on. Leave --suite and --task out.")
     if settings.base != "own" and settings.task is None:
         raise BidexError(f"--base {settings.base} goes with --task; a suite's file says whether bases move.")
+    refuse_unused(settings, _UNUSED.get(kind, ("starts", "shift")), f"in record {kind}")
+    if settings.starts == "tasks":
+        refuse_unused(settings, ("shift",), "with --starts tasks")
 
 
 def _record(config: RecordConfig, collection: _Collection) -> tuple[Path, str]:

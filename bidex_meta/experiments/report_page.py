@@ -16,7 +16,8 @@ from bidex_meta.config import RunConfig, flat
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import History, estimates, read_groups, read_histories
 from bidex_meta.evaluation.statistics import NONE
-from bidex_meta.experiments.comparing import class_table, group_table
+from bidex_meta.experiments.comparing import class_table, group_table, setting_lines
+from bidex_meta.experiments.plotting import is_offline, steps_of
 from bidex_meta.runs import plots, training_seconds
 from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.evaluations import MetaTestEvaluation
@@ -25,7 +26,6 @@ from bidex_meta.runs.video import FILMS
 from bidex_meta.utils.files import is_file, portable
 
 FILM_BYTES = 40_000_000  # maximum number of bytes of all films of a page; further films are only named
-_SPEED = {"Perf/steps_per_second": "environment steps / s", "Perf/training_time": "training time (s)"}
 
 
 def render(runs: Sequence[Run]) -> str:
@@ -36,6 +36,8 @@ def render(runs: Sequence[Run]) -> str:
     curves = [(name, history.curves) for name, history in named]
     names = _names(named)
     configs = [run.config() for run in runs]
+    steps = steps_of(runs)
+    speed = {"Perf/steps_per_second": f"{steps} / s", "Perf/training_time": "training time (s)"}
     algos = ", ".join(dict.fromkeys(config.algo for config in configs))
     subjects = ", ".join(dict.fromkeys(Path(config.suite or config.task or "").stem for config in configs))
     short_names = {}
@@ -49,8 +51,8 @@ def render(runs: Sequence[Run]) -> str:
         groups=[(name, history.label, len(history.runs)) for name, history in named],
         runs=[_run(run, names[run.path]) for run in runs],
         final=_final(runs, short_names),
-        learning=_picture(lambda: plots.draw_learning(curves)),
-        speed=_picture(lambda: plots.draw_metrics(curves, _SPEED)),
+        learning=_picture(lambda: plots.draw_learning(curves, steps)),
+        speed=_picture(lambda: plots.draw_metrics(curves, speed, steps)),
         adaptation=list(_adaptation(runs, names)),
         differences=_differences(runs, names),
         configs=[(names[run.path], _json(config)) for run, config in zip(runs, configs, strict=True)],
@@ -76,9 +78,7 @@ def _names(histories: Sequence[tuple[str, History]]) -> dict[Path, str]:
     for group, history in histories:
         for run in history.runs:
             config = run.config()
-            name = f"{group}{f', {config.task}' if config.task else ''}, seed {config.seed}"
-            twice = sum(known.split(" (")[0] == name for known in names.values())
-            names[run.path] = f"{name} ({twice + 1})" if twice else name
+            names[run.path] = f"{group}{f', {config.task}' if config.task else ''}, seed {config.seed}"
     return names
 
 
@@ -89,11 +89,12 @@ def _run(run: Run, name: str) -> Json:
     speeds = [row["Perf/steps_per_second"] for row in rows if row.get("Perf/steps_per_second") is not None]
     hardware = ", ".join(versions.get("gpus") or []) or f"{versions.get('cpus', '?')} processors"
     git = versions.get("git") or {}
-    speed = f"{median(speeds):,.0f}" if speeds else NONE
+    unit = " updates" if is_offline(run) else ""
+    speed = f"{median(speeds):,.0f}{unit}" if speeds else NONE
     dirty = "+" if git.get("dirty") else ""
     return {
         "name": name, "path": portable(str(run.path)), "on": portable(config.suite or config.task),
-        "steps": f"{max((row['step'] for row in rows), default=0):,}",
+        "steps": f"{max((row['step'] for row in rows), default=0):,}{unit}",
         "hours": f"{training_seconds(rows) / 3600.0:.2f}",
         "speed": speed,
         "environments": f"{config.num_envs:,}",
@@ -109,9 +110,10 @@ def _final(runs: Sequence[Run], short: dict[Path, str]) -> Json:
     to the short name of its group.
     """
     evaluated = [run for run in runs if run.evaluated]
-    found: Json = {"missing": len(runs) - len(evaluated), "reason": "", "picture": None, "tables": []}
+    found: Json = {"missing": len(runs) - len(evaluated), "reason": "", "picture": None, "tables": [], "settings": []}
     try:
         groups = [replace(group, label=short[group.paths[0]]) for group in read_groups(evaluated)]
+        found["settings"] = setting_lines(groups)
     except BidexError as error:
         reason = str(error)
         for run in runs:
@@ -135,7 +137,8 @@ def _adaptation(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[s
         with suppress(BidexError):  # the final table reports the error
             found = run.evaluation()
             if isinstance(found, MetaTestEvaluation):
-                picture = _picture(lambda found=found, path=run.path: plots.draw_adaptation(found, path))
+                goal = run.goal
+                picture = _picture(lambda found=found, goal=goal: plots.draw_adaptation(found, "", goal))
                 if picture is not None:
                     yield names[run.path], picture
 
@@ -168,13 +171,19 @@ def _films(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[str, s
         newest: dict[str, Path] = {}
         named = (path for path in run.videos_path.glob("*") if path.suffix.lower() in FILMS)
         films = filter(is_file, named)  # reading a pipe with such a name would never end
-        for path in sorted(films, key=lambda path: path.stat().st_mtime):
+        for path in sorted(films, key=_film_step):
             kind, _, step = path.stem.rpartition("_")
             newest[kind if step.isdigit() and kind else path.stem] = path
         for path in newest.values():
             fits = path.stat().st_size <= room
             room -= path.stat().st_size if fits else 0
             yield names[run.path], path.name, _data(path.read_bytes(), FILMS[path.suffix.lower()]) if fits else None
+
+
+def _film_step(path: Path) -> tuple[int, str]:
+    """Return the number at the end of a film's name, which is the step of a training film, and the name."""
+    step = path.stem.rpartition("_")[2]
+    return int(step) if step.isdecimal() else -1, path.name
 
 
 def _picture(draw: Callable[[], Any]) -> str | None:

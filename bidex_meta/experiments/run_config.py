@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bidex_meta.data import part_files
-from bidex_meta.errors import BidexError, one_line
+from bidex_meta.errors import BidexError, one_line, shortened, unknown_name
 from bidex_meta.experiments import run_data, run_teachers
 from bidex_meta.experiments.conditions import check_worlds_of
 from bidex_meta.experiments.learners import choose_preset, learner_kind, resolve_device
@@ -40,6 +40,9 @@ def resolve(config: AnyConfig, where: str = "run") -> AnyConfig:
     kind = learner_kind(config.algo, source.class_name)
     device = resolve_device(config.device, source.on_gpu)
     preset, _ = choose_preset(kind, config.preset, device, source.preset)
+    if config.preset == "auto" and isinstance(config.learner, LearnerConfig):
+        # Given values have the name of the preset that they equal.
+        preset = next((name for name, values in kind.presets.items() if values == config.learner), preset)
     num_envs, steps = source.rows_and_steps(device, Capability.ADAPTS in kind.make.capabilities)
     if kind.make.environments_per_class and device == "cpu":
         num_envs = kind.make.environments_per_class * len(source.tasks("train"))
@@ -100,11 +103,11 @@ def check(config: AnyConfig, with_memory: bool = True) -> None:
         check_memory(needed, what, "Lower it, or the learner's layers, steps or replay.")
 
 
-def check_resumed(folder: RunFolder, config: AnyConfig) -> None:
-    """Raise BidexError if a run cannot be resumed with a resolved config.
+def resumed(folder: RunFolder, config: AnyConfig) -> AnyConfig:
+    """Return the config with which a run continues, given a resolved config; it records the same environments.
 
-    The config must equal the run's, apart from fields that may change. The number of processes, the physics and the
-    suite must be the same as when the run was made.
+    Raises BidexError if the config differs from the run's in other fields than those that may change. The number of
+    processes, the physics and the suite must be the same as when the run was made.
     """
     stored = resolve(folder.config(), str(folder.config_path))
     processes = folder.config().processes
@@ -112,6 +115,12 @@ def check_resumed(folder: RunFolder, config: AnyConfig) -> None:
         raise BidexError(
             f"{folder.path} has worlds of {processes} process(es), not {config.processes}. "
             f"Continue: {resume_command(folder.path, processes)}"
+        )
+    done = folder.checkpoints.newest_step() or 0
+    if config.steps < min(stored.steps, done):
+        raise BidexError(
+            f"{folder.path} has trained for {done:,} steps, expected --steps of at least that, got {config.steps:,}. "
+            "Raise it, or leave it out."
         )
     for name, before, after in stored.differences(config, ignored=("record_share",)):
         flag = "--" + name.replace("_", "-")
@@ -121,6 +130,7 @@ def check_resumed(folder: RunFolder, config: AnyConfig) -> None:
         )
     mend = "Resume with the versions in versions.json, or start a new run from it: --start-from RUN."
     check_worlds_of(folder, open_worlds(config.to_json()), mend)
+    return replace(config, record_share=stored.record_share)
 
 
 def preset_reason(config: AnyConfig) -> str:
@@ -155,14 +165,20 @@ def _written(name: str | None) -> str | None:
 def _learner_config(preset: Any, config: AnyConfig, where: str) -> Any:
     """Return the learner's settings: unchanged, or a preset in which the given values replace the preset's values."""
     if not isinstance(config.learner, Mapping):
+        if type(config.learner) is not type(preset):
+            raise BidexError(
+                f"{where}: learner: expected a {type(preset).__name__} or a mapping of options, got "
+                f"{shortened(config.learner)}. Take one of the presets of {config.algo}."
+            )
         return config.learner
+    for name in config.learner:
+        if not isinstance(name, str):
+            raise BidexError(f"{where}: learner: expected names of options, got {shortened(name)}. Correct it.")
     values = {name: tuple(value) if isinstance(value, list) else value for name, value in config.learner.items()}
-    unknown = set(values) - {entry.name for entry in dataclasses.fields(preset)}
-    if unknown:
-        raise BidexError(
-            f"{where} sets {', '.join(sorted(unknown))}, which this version of {config.algo} does not have. "
-            "Resume with the version in versions.json, or leave it out."
-        )
+    known = [entry.name for entry in dataclasses.fields(preset)]
+    for name in sorted(set(values) - set(known)):
+        fault = unknown_name(f"option of {config.algo}", name, known)
+        raise BidexError(f"{where}: {fault} A run of another version resumes with the version in its versions.json.")
     try:
         return replace(preset, **values)
     except BidexError as error:

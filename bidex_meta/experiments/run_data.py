@@ -21,7 +21,7 @@ from bidex_meta.world.contract import VectorWorld
 from bidex_meta.worlds import Worlds
 
 UPDATES = 300_000  # default number of updates of an offline run
-_FORM = ("suite", "task", "base", "object", "points", "touch")
+_FORM = ("suite", "task", "base", "object", "points", "touch", "tasks_per_class")
 
 
 def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Sequence[Json], **more: object) -> Json:
@@ -31,6 +31,7 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
 
     - ``suite`` and ``suite_version``, or ``task``, ``base`` and ``object``; the others are None
     - ``points``: number of points of the observed point cloud; ``touch``: whether observations show touch sensors
+    - ``tasks_per_class``: number of train tasks per class if it is not the suite's own; otherwise None
     - ``tasks``: names of the world's slots (classes, or listed tasks as Class/task)
     - ``instructions``: instruction of each slot's class
     - ``physics``: {class: digest of its physics}, empty for another library's classes; ``joined.join`` compares it
@@ -55,7 +56,11 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
         base = {None: "own", True: "moving", False: "fixed"}[source.moving_base]
     slots = getattr(world, "slots", ())
     rules = asdict(slots[0].task_class.rules) if slots else asdict(V1)
-    version = source.suite.version if source.suite else None
+    version = None
+    count = None
+    if source.suite:
+        version = source.suite.version
+        count = source.suite.train_tasks
     drawn = getattr(getattr(world, "unwrapped", world), "randomisation", None)
     if drawn is not None:
         drawn = asdict(drawn)
@@ -64,6 +69,7 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
         "suite_version": version,
         "task": alone, "object": source.object, "points": source.points, "touch": source.touch,
         "base": base,
+        "tasks_per_class": count,
         "tasks": list(world.task_names),
         "instructions": {slot.name: slot.task_class.instruction() for slot in slots},
         "physics": class_physics(slots),
@@ -96,8 +102,9 @@ def open_datasets(names: Sequence[str]) -> list[Dataset]:
 def implied(datasets: Sequence[Dataset]) -> Json:
     """Return the settings of the world in which all data sets were recorded.
 
-    The settings are ``suite``, or ``task``, ``base`` and ``object``; and ``points`` and ``touch``. The dict is empty if
-    there are no data sets, or if the first has no metadata of this package. Raises BidexError if the settings differ.
+    The settings are ``suite``, or ``task``, ``base`` and ``object``; and those of ``_FORM`` that follow. The dict is
+    empty if there are no data sets, or if the first has no metadata of this package. Raises BidexError if the settings
+    differ.
     """
     forms = [tuple(dataset.metadata.get(name) or None for name in _FORM) for dataset in datasets]
     if not forms or forms[0][:2] == (None, None):
@@ -111,6 +118,7 @@ def implied(datasets: Sequence[Dataset]) -> Json:
         "base": f"{same}, or what fits all: --task NAME --base BASE.",
         "points": f"{same}.",
         "touch": f"{same}.",
+        "tasks_per_class": f"{same}.",
         "object": suite,
     }
     usual = {"points": 0, "touch": False, "object": "its own"}

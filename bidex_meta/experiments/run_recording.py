@@ -1,5 +1,6 @@
 """Recording of a run's transitions (``RunConfig.record``): a collector wraps the run's world and stores them."""
 
+import math
 from pathlib import Path
 
 from bidex_meta.data import part_files, writer
@@ -16,20 +17,24 @@ from bidex_meta.worlds import Worlds
 def recorded(config: AnyConfig, folder: Path, world: PooledWorld) -> RunCollector:
     """Wrap the world of a run in a collector, which stores the transitions of some environments.
 
-    The collector stores the share ``config.record_share`` of the environments, so that it collects about
-    ``config.record`` transitions in the whole run. ``folder`` is the run's folder. Raises BidexError if the disk is too
-    small for the transitions, or the memory for the running episodes.
+    The collector stores the share ``config.record_share`` of the environments, at least one of each class, so that it
+    collects ``config.record`` transitions or more in the whole run. ``folder`` is the run's folder. Raises BidexError
+    if the disk is too small for the transitions, or the memory for the running episodes.
     """
     rows = spread_environments(world, config.record_share)
+    size = math.ceil(config.steps * len(rows) / world.num_envs)
     sizes = world.single_observation_space.shape[0], world.single_action_space.shape[0]
-    needed = writer.estimated_bytes(config.record, *sizes, 20.0)
+    needed = writer.estimated_bytes(size, *sizes, 20.0)
     # Bytes that a resumed run has already stored.
     there = sum(path.stat().st_size for path in part_files.parts_of(folder / "replay" / "data"))
-    writer.check_room(folder, max(0, needed - there), f"{config.record:,} transitions")
+    writer.check_room(folder, max(0, needed - there), f"{size:,} transitions")
     # A checkpoint copies the running episodes, and each process of this machine has its own episodes.
     held = 2 * launch().local_count * bytes_held(world, rows)
     check_memory(held, f"The running episodes of {len(rows):,} recorded rows", "Lower --record or --num-envs.")
-    say(f"Recording {len(rows)} of {world.num_envs} rows, at most about {needed / 1e9:.2f} GB.")
+    say(
+        f"Recording {len(rows)} of {world.num_envs} environments: about {size:,} transitions, at most about "
+        f"{needed / 1e9:.2f} GB."
+    )
     return RunCollector(world, rows, launch().rank)  # pyright: ignore[reportAbstractUsage]
 
 

@@ -29,7 +29,7 @@ _WHOLE = ("steps", "record")
 _MOST_RUNS = 10_000
 _IN_NAMES = r"\w.+ -"  # characters of a run folder's name, before spaces become hyphens
 
-_Name = Annotated[str, Meta(pattern=rf"^[{_IN_NAMES}]{{1,60}}\Z")]
+_Name = Annotated[str, Meta(pattern=rf"^(?![. ]*\Z)[{_IN_NAMES}]{{1,60}}\Z")]
 _Texts = Annotated[tuple[Text, ...], Meta(min_length=1)]
 _Seeds = Annotated[tuple[Seed, ...], Meta(min_length=1)]
 
@@ -164,7 +164,7 @@ class SweepPlan:
         """
         runs = []
         for name, config in configs.items():
-            if re.fullmatch(rf"[{_IN_NAMES}]+", name) is None:
+            if re.fullmatch(rf"[{_IN_NAMES}]+", name) is None or not name.strip(". "):
                 raise BidexError(f"Expected the name of a folder, got {shortened(name)}.")
             given = replace(config, threads=config.threads or 1)
             runs.append(PlannedRun(expanded(folder) / name, given, name))

@@ -8,13 +8,18 @@ from statistics import mean
 from typing import Literal, NamedTuple
 
 from bidex_meta.errors import BidexError, one_line
+from bidex_meta.experiments import metatest
 from bidex_meta.experiments.evaluating import FinalEvaluation
+from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.experiments.run_config import check, resolve
 from bidex_meta.experiments.sweep_plan import PlannedRun, SweepPlan
-from bidex_meta.runs.evaluations import Evaluated, MetaTestEvaluation
+from bidex_meta.runs.evaluations import Evaluated, MetaTestEvaluation, SplitSummary
 from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.runs.metrics import last_rows
+from bidex_meta.suite import OTHERS
+from bidex_meta.training.learner import Capability
 from bidex_meta.utils.files import JsonObject, absolute, exists, is_file
+from bidex_meta.worlds import Worlds, open_worlds
 
 
 class State(NamedTuple):
@@ -47,7 +52,7 @@ def states_of(plan: SweepPlan) -> list[State]:
     configs: dict[str, AnyConfig] = {}  # runs that differ only in the seed share a config
     runs = []
     for run in plan.runs:
-        kind = str(replace(run.given, seed=0, start_from=None))
+        kind = str((replace(run.given, seed=0, start_from=None), run.final))
         if kind not in configs:
             try:
                 configs[kind] = _resolved(run)
@@ -61,26 +66,41 @@ def states_of(plan: SweepPlan) -> list[State]:
 def _resolved(run: PlannedRun) -> AnyConfig:
     config = resolve(run.given)
     check(config)
+    if Capability.ADAPTS in learner_kind(config.algo, config.task).make.capabilities:
+        metatest.check_worlds(open_worlds(config.to_json()), config.algo)
     run.final.check(config)
     return config
 
 
 def state_of(run: PlannedRun) -> State:
-    """Return the progress of a run with resolved config; raise BidexError if its folder has another config."""
+    """Return the progress of a run with resolved config.
+
+    Raises BidexError if its folder has a run with another config, or one that has trained for more steps.
+    """
     last: JsonObject = {"step": 0}
     evaluated = False
+    stored = run.config
     if exists(run.folder.config_path):
+        stored = run.folder.config()
         # Threads and device are ignored, because the machine may have changed.
-        for name, there, here in run.folder.config().differences(run.config, ignored=("threads", "device")):
+        for name, there, here in stored.differences(run.config, ignored=("threads", "device")):
             raise BidexError(
                 f"{run.path} is a run with another config: its {name} is {there}, not {here}. Give the arm another "
                 "name, or move the folder away."
             )
         if is_file(run.folder.metrics_path):
             last = (last_rows(run.folder.metrics_path) or [last])[-1]
-        evaluated = run.folder.evaluated and _played(run.final, run.folder.evaluation())
+        evaluated = run.folder.evaluated and _played(run, run.folder.evaluation())
+        if run.config.steps < min(stored.steps, last["step"]):
+            raise BidexError(
+                f"{run.path} has trained for {last['step']:,} steps, expected at most {run.config.steps:,}. Give the "
+                "arm another name, or move the folder away."
+            )
     why = last_line(beside(run, "failed"))
     steps = run.config.goal(last)
+    limit = run.config.minutes
+    if limit is not None and (stored.minutes is None or limit > stored.minutes):
+        steps = run.config.steps  # the run was not ended by this time limit
     if locked(run):
         state = "runs"
     elif evaluated and (run.folder.evaluation().steps or steps) >= steps:
@@ -92,16 +112,36 @@ def state_of(run: PlannedRun) -> State:
     return State(run, state, last["step"], steps, last.get("Perf/training_time") or 0.0, why)
 
 
-def _played(final: FinalEvaluation, evaluation: Evaluated) -> bool:
-    """Return whether a stored evaluation has all parts that a sweep asks for; its file may have changed since."""
+def _played(run: PlannedRun, evaluation: Evaluated) -> bool:
+    """Return whether a stored evaluation is the one that a sweep asks for; its file may have changed since."""
+    final = run.final
     if not isinstance(evaluation, MetaTestEvaluation):
-        return not final.other_tasks or evaluation.other_tasks is not None
+        same_episodes = final.episodes in (None, evaluation.policy.episodes_per_task)
+        return same_episodes and (not final.other_tasks or evaluation.other_tasks is not None)
     wanted = {"auto": (), "unseen": ("others", "test")}.get(final.split, (final.split,))
     if not evaluation.splits.keys() >= set(wanted):
         return False
-    parts = evaluation.splits.values()
-    same_shots = final.shots is None or all(part.shots == final.shots for part in parts)
-    return same_shots and (not final.hidden_rewards or all(part.hidden_by_shot is not None for part in parts))
+    worlds = open_worlds(run.config.to_json())
+    return all(_asked_for(final, part, split, worlds) for split, part in evaluation.splits.items())
+
+
+def _asked_for(final: FinalEvaluation, part: SplitSummary, split: str, worlds: Worlds) -> bool:
+    """Return whether the meta-test on a split has the numbers that a sweep asks for."""
+    if final.hidden_rewards and part.hidden_by_shot is None:
+        return False
+    if split == OTHERS:
+        pools = worlds.others.tasks("train")
+    else:
+        pools = worlds.tasks(split)
+    # A meta-test plays fewer tasks or rollouts if there are not enough tasks or environments.
+    limits = {"tasks": max(map(len, pools.values())), "rollouts": max(1, metatest.ENVIRONMENTS // len(pools))}
+    tasks = next(iter(part.before.classes.values())).tasks
+    found = {"tasks": tasks, "rollouts": part.rollouts, "shots": part.shots, "episodes": part.before.episodes_per_task}
+    for name, number in found.items():
+        asked = getattr(final, name)
+        if None not in (asked, number) and number not in (asked, min(asked, limits.get(name, asked))):
+            return False
+    return True
 
 
 def hours_left(states: Sequence[State]) -> list[float]:

@@ -24,7 +24,7 @@ from bidex_meta.experiments.sweep_progress import State, beside, last_line, lock
 from bidex_meta.runs import RunFolder
 from bidex_meta.training.launch import BATCH_SIGNALS, say
 from bidex_meta.utils.arguments import checked_arguments
-from bidex_meta.utils.files import JsonObject, exists, is_file, read_text
+from bidex_meta.utils.files import JsonObject, absolute, exists, is_file, read_text
 from bidex_meta.utils.validation import Few
 from bidex_meta.utils.waiting import note
 
@@ -71,15 +71,22 @@ def sweep(plan: SweepPlan, *, workers: Few | None = None, cores: str | None = No
 def submit_plan(plan: SweepPlan, executor: Literal["slurm", "local"]) -> dict[str, str]:
     """Submit to submitit's executor the runs that can begin now; return the jobs' ids by the runs' names."""
     states = states_of(plan)
-    unfinished = {state.run.path for state in states if state.state != "done"}
+    unfinished = {absolute(state.run.path) for state in states if state.state != "done"}
     idle = [state.run for state in states if state.state in ("left", "failed")]
-    ready = [run for run in idle if run.after not in unfinished]
+    ready = [run for run in idle if _first(run) not in unfinished]
     plan.folder.mkdir(parents=True, exist_ok=True)
     with _alone_in(plan):
         jobs = submit(ready, plan.folder, executor, plan.slurm)
     if len(ready) < len(idle):
         say(f"{len(idle) - len(ready)} start from runs that have not ended: submit again when those have.")
     return {name: job.job_id for name, job in jobs.items()}
+
+
+def _first(run: PlannedRun) -> Path | None:
+    """Return the absolute path of the run that must end before a run may begin; None if there is none."""
+    if run.after is None:
+        return None
+    return absolute(run.after)
 
 
 def _alone_in(plan: SweepPlan) -> contextlib.AbstractContextManager[None]:
@@ -199,13 +206,14 @@ def work(runs: Sequence[PlannedRun], cores: Sequence[int | None]) -> int:
     with ThreadPoolExecutor(len(cores), initializer=bind) as pool:
         try:
             while waiting or own:
-                unfinished = {run.path for run in (*waiting, *(job.run for job in own.values()))}
-                ready = [run for run in waiting if run.after not in unfinished]
+                unfinished = {absolute(run.path) for run in (*waiting, *(job.run for job in own.values()))}
+                ready = [run for run in waiting if _first(run) not in unfinished]
                 for run in ready[: len(cores) - len(own)]:
                     waiting.remove(run)
-                    if run.after is not None and run.after in failed:
-                        failed[run.path] = "has failed"
-                        say(f"{run.name} failed: it starts from {run.after.name}, which {failed[run.after]}")
+                    first = _first(run)
+                    if first is not None and first in failed:
+                        failed[absolute(run.path)] = "has failed"
+                        say(f"{run.name} failed: it starts from {first.name}, which {failed[first]}")
                         continue
                     say(f"{run.name} {'is waited for: another process trains it' if locked(run) else 'begins'}")
                     jobs.append(Job(run, COMMAND))
@@ -215,10 +223,10 @@ def work(runs: Sequence[PlannedRun], cores: Sequence[int | None]) -> int:
                     error = future.exception()
                     end = "done"
                     if error is not None:
-                        failed[run.path] = "has failed"
+                        failed[absolute(run.path)] = "has failed"
                         end = f"failed: {one_line(error)}"
                     elif not future.result():
-                        failed[run.path] = "was stopped"
+                        failed[absolute(run.path)] = "was stopped"
                         end = "was stopped by a signal"
                     say(f"{run.name} {end} ({len(waiting) + len(own)} to go)")
         except BaseException:

@@ -19,7 +19,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.experiments import metatest, run_data, run_recording, run_teachers, watching
 from bidex_meta.experiments.learners import LearnerKind, learner_kind
 from bidex_meta.experiments.policies import checkpoint, fitting, say_other_classes, say_other_rules
-from bidex_meta.experiments.run_config import check, check_resumed, preset_reason, resolve
+from bidex_meta.experiments.run_config import check, preset_reason, resolve, resumed
 from bidex_meta.runs import Recorder, RunFolder, mend, training_seconds
 from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.folder import AnyConfig, check_new, new_folder_name
@@ -134,7 +134,7 @@ def _checked(config: AnyConfig | None, old: RunFolder | None) -> AnyConfig:
         config = resolve(config)
     else:
         config = resolve(old.config() if config is None else config, str(old.config_path))
-        check_resumed(old, config)
+        config = resumed(old, config)
     check(config)
     return config
 
@@ -323,6 +323,8 @@ def _train(
         if config.evaluate_every is not None or config.video_every is not None:
             watch = watching.Watch(config, run.kind, run.worlds, folder, learner, record, len(rows))
             stack.callback(watch.close)
+        if config.stops_by_training:
+            watch = watching.with_episodes(run.world, watch)
         if on_event is not None:
             call = on_event
             record.on_log = lambda metrics, step: call(Event("iteration", folder, step, metrics))

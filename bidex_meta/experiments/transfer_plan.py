@@ -119,6 +119,8 @@ def suite_file(worlds: Any, name: str, folder: Path) -> Path:
         content["points"] = {"count": suite.points, "kinds": suite.point_kinds}
     if suite.touch:
         content["touch"] = True
+    if suite.randomisation is not None:
+        content["randomisation"] = {key: _listed(value) for key, value in vars(suite.randomisation).items()}
     lines = [f"{key} = {_toml(value)}" for key, value in content.items()]
     text = "\n".join([*lines, "classes = [", *(f"    {_toml(entry)}," for entry in entries), "]\n"])
     path = folder / f"{content['name']}.toml"
@@ -135,6 +137,13 @@ def _entry(each: SuiteClass, split: str) -> dict[str, Any]:
         own = {}
     scale = {"reward_scale": each.reward_scale, "options": dict(each.options)}
     return {"name": each.class_name, "split": split, **scale, **own}
+
+
+def _listed(value: object) -> object:
+    """Return a tuple as a list, and any other value unchanged."""
+    if isinstance(value, tuple):
+        return list(value)
+    return value
 
 
 def _toml(value: object) -> str:
@@ -238,7 +247,8 @@ def cells_of(
     """
     preset = replace(config, learner=learner_kind(config.algo).presets[config.preset]).learner_values
     changed = {key: value for key, value in config.learner_values.items() if value != preset[key]}
-    base = replace(config, suite=str(file))
+    # The share of the recorded environments follows from the steps, which differ between the tracks.
+    base = replace(config, suite=str(file), record_share=0.0)
     tracks: list[tuple[int | None, AnyConfig]] = []
     for count in counts:
         if count and dataset is None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError, one_line
 from bidex_meta.evaluation.agreement import DIFFERS, EQUAL, WITHIN, Agreement, agreements
 from bidex_meta.experiments.conditions import conditions
@@ -18,7 +19,9 @@ from bidex_meta.runs.evaluations import (
     Conditions,
     Evaluated,
     MetaTestEvaluation,
+    OtherTasks,
     PolicyEvaluation,
+    Summary,
     read_evaluation,
 )
 from bidex_meta.runs.folder import AnyConfig
@@ -44,6 +47,8 @@ class Verification:
     conditions: Sequence[str]
     """Differences between the conditions of the two evaluations, one text for each."""
     classes: Sequence[Agreement]
+    unverified: Sequence[str]
+    """Recorded results that are not compared."""
 
     def count(self, outcome: str) -> int:
         """Return the number of classes with the given outcome: ``equal``, ``within`` or ``differs``.
@@ -61,6 +66,7 @@ class Verification:
         """Return the verification as a dict, ready for JSON: run, steps, conditions and results by class."""
         report: Json = {"run": str(self.run.path), "steps": self.steps, "conditions": list(self.conditions)}
         report |= {outcome: self.count(outcome) for outcome in (EQUAL, WITHIN, DIFFERS)}
+        report["unverified"] = list(self.unverified)
         return report | {"classes": {each.name: each.to_json() for each in self.classes}}
 
 
@@ -102,7 +108,8 @@ def verify(
         say(f"Conditions: {one_line(line)}.")
     again = _again(folder, config, worlds, recorded, environments, state)
     found = agreements(recorded.all_results, again)
-    return Verification(folder, f"{config.algo} on {worlds.name}, {step:,} steps", step, apart, found)
+    title = f"{config.algo} on {worlds.name}, {step:,} steps"
+    return Verification(folder, title, step, apart, found, recorded.unverified)
 
 
 def recorded_evaluation(run: Path, named: Path | None = None) -> Evaluated:
@@ -124,6 +131,9 @@ def recorded_evaluation(run: Path, named: Path | None = None) -> Evaluated:
     needed = {"steps": evaluation.steps, "seed": evaluation.seed}
     if isinstance(evaluation, PolicyEvaluation):
         needed["policy.episodes_per_task"] = evaluation.policy.episodes_per_task
+        if evaluation.other_tasks is not None:
+            needed["other_tasks.policy.episodes_per_task"] = evaluation.other_tasks.policy.episodes_per_task
+            needed["other_tasks.task_seed"] = evaluation.other_tasks.task_seed
     else:
         for name, split in evaluation.splits.items():
             needed[f"splits.{name}.before.episodes_per_task"] = split.before.episodes_per_task
@@ -178,11 +188,12 @@ def _again(
             kind = "no meta-test"
         raise BidexError(f"{folder.path}: the evaluation is {kind}, which is not how {config.algo} is evaluated.")
     if isinstance(recorded, PolicyEvaluation):
-        world = worlds.world(recorded.split, num_envs)
-        protocol = worlds.protocol(recorded.split, recorded.policy.episodes_per_task, seed)
-        found = worlds.judge(load(), world, protocol)
-        world.close()
-        return found.summary().classes
+        own = _replayed(worlds, load(), recorded, seed, num_envs)
+        others = recorded.other_tasks
+        if others is not None:
+            unseen = worlds.with_new_tasks(others.task_seed or 0)
+            others = replace(others, policy=_replayed(unseen, load(), others, others.seed or seed, num_envs))
+        return replace(recorded, policy=own, other_tasks=others).all_results
     splits = {}
     adaptation = Adaptation.of(worlds, config)
     for split, part in recorded.splits.items():
@@ -202,6 +213,17 @@ def _again(
             adaptation = replace(adaptation, max_adapt_steps=part.max_adapt_steps)
         splits[split] = meta_test(worlds, adaptation, load, options, [split])[split].summary()
     return MetaTestEvaluation(splits=splits).all_results
+
+
+def _replayed(
+    worlds: Worlds, policy: Agent, recorded: PolicyEvaluation | OtherTasks, seed: int, num_envs: int | None
+) -> Summary:
+    """Repeat a recorded evaluation of a policy that does not adapt, on the tasks of ``worlds``."""
+    world = worlds.world(recorded.split, num_envs)
+    protocol = worlds.protocol(recorded.split, recorded.policy.episodes_per_task, seed)
+    found = worlds.judge(policy, world, protocol)
+    world.close()
+    return found.summary()
 
 
 def recorded_conditions(evaluation: Evaluated, versions: Versions, config: AnyConfig) -> Conditions:

@@ -2,14 +2,16 @@
 
 import math
 import random
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 
 from bidex_meta.agents import Agent
+from bidex_meta.config import EPISODES
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.filming import Look, film_tiles
 from bidex_meta.evaluation.play import evaluate
@@ -149,6 +151,21 @@ class Watch:
             self._record.film("training", frames, CONTROL_RATE / _FILM_EVERY, self._learner.env_steps)
         except (BidexError, OSError) as error:
             say(f"No film at {self._learner.env_steps:,} steps: {error}")
+
+
+def with_episodes(world: Any, watch: Callable[[], dict[str, float]] | None) -> Callable[[], dict[str, float]]:
+    """Return a function that adds the number of finished episodes to the metrics of ``watch``, which may be None.
+
+    The number is that of the class with the fewest. First episodes are left out, because they may be shortened.
+    """
+
+    def watched() -> dict[str, float]:
+        finished = (world.episodes.number - 1).clamp(min=0).cpu()
+        by_class = torch.bincount(world.task_id.cpu(), weights=finished, minlength=world.num_tasks)
+        metrics = watch() if watch else {}
+        return {**metrics, EPISODES: float(by_class.min())}
+
+    return watched
 
 
 def played(pools: Mapping[str, Sequence[str]]) -> tuple[int, int]:

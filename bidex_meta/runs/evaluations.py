@@ -16,6 +16,8 @@ from bidex_meta.runs.atomic import Json, write_json
 from bidex_meta.utils.files import read_json
 from bidex_meta.utils.validation import Environments, Few, Finite, Seed, Shots, Text, Threads, Whole, parse
 
+_DERIVED = ("means over classes", "intervals")  # results that follow from those of the classes and their episodes
+
 Interval = tuple[Finite, Finite]  # Lower and upper end of a 95 % bootstrap interval.
 Engine = Literal["auto", "c", "warp"]
 
@@ -166,8 +168,18 @@ class PolicyEvaluation:
 
     @property
     def all_results(self) -> dict[str, ClassSummary]:
-        """Return the results that a verification compares: the results by class."""
-        return self.policy.classes
+        """Return the results that a verification compares: the results by class, also those on other tasks."""
+        rows = dict(self.policy.classes)
+        if self.other_tasks is not None:
+            for name, row in self.other_tasks.policy.classes.items():
+                rows[f"{name} (other tasks)"] = row
+        return rows
+
+    @property
+    def unverified(self) -> list[str]:
+        """Name the recorded results that a verification does not compare."""
+        random = any(part is not None and part.random is not None for part in (self, self.other_tasks))
+        return ["random policy"] * random + [*_DERIVED]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,8 +227,23 @@ class MetaTestEvaluation:
                         rows[f"{name} ({split}, shot {number}{text})"] = row
         return rows
 
+    @property
+    def unverified(self) -> list[str]:
+        """Name the recorded results that a verification does not compare."""
+        return ["gains", *_DERIVED]
+
 
 Evaluated = PolicyEvaluation | MetaTestEvaluation
+
+
+def unusual_settings(evaluation: Evaluated) -> list[str]:
+    """Name an evaluation's split unless it is ``train``, and its randomisation if there is one."""
+    settings = []
+    if evaluation.split != "train":
+        settings.append(f"split {evaluation.split}")
+    if evaluation.randomisation is not None:
+        settings.append("randomised")
+    return settings
 
 
 def read_evaluation(path: Path, again: str) -> Evaluated:

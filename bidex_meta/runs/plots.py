@@ -39,15 +39,15 @@ _MEASURES = ("return", "success")
 _STYLES = {"Train": "-", "Eval": "--"}  # line styles by family of tags
 _FEW = 60  # maximum number of evaluations drawn as dots; more dots would hide the dashes
 _COLOURS = {"train": "tab:blue", "test": "tab:orange"}
-_STEPS = "environment steps (millions)"
-_MILLIONS = (1e6, _STEPS)  # size of one unit of an axis, and the unit's name
+STEPS = "environment steps"
+_MILLIONS = (1e6, f"{STEPS} (millions)")  # size of one unit of an axis, and the unit's name
 
 
-def draw_learning(groups: Sequence[Group]) -> "Figure":
-    """Draw return and success of every task against environment steps, with one line per group of runs.
+def draw_learning(groups: Sequence[Group], steps: str = STEPS) -> "Figure":
+    """Draw return and success of every task against training steps, with one line per group of runs.
 
     Each task has its own panels, because returns differ by orders of magnitude. Evaluations during training are dashed.
-    Raises BidexError if no episode has ended yet.
+    ``steps`` says what a step is. Raises BidexError if no episode has ended yet.
     """
     starts = tuple(f"{family}/{measure}/" for measure, family in product(_MEASURES, _STYLES))
     tags = [tag for tag in chain.from_iterable(curves for _, curves in groups) if tag.startswith(starts)]
@@ -63,21 +63,21 @@ def draw_learning(groups: Sequence[Group]) -> "Figure":
             axis.grid(alpha=0.3)
         panels[0].set_title(_plain(name))
         panels[1].set_ylim(-0.02, 1.02)
-        panels[1].set_xlabel(_STEPS)
+        panels[1].set_xlabel(f"{steps} (millions)")
     if len(groups) > 1:
         _add_legend(figure, [label for label, _ in groups])
     return figure
 
 
-def draw_metrics(groups: Sequence[Group], tags: Mapping[str, str]) -> "Figure":
-    """Draw metrics against environment steps, with one panel per metric and one line per group of runs.
+def draw_metrics(groups: Sequence[Group], tags: Mapping[str, str], steps: str = STEPS) -> "Figure":
+    """Draw metrics against training steps, with one panel per metric and one line per group of runs.
 
-    ``tags`` maps the tag of each metric to the label of its panel.
+    ``tags`` maps the tag of each metric to the label of its panel. ``steps`` says what a step is.
     """
     figure = _figure(5.2 * len(tags), 3.0)
     labels = [label for label, _ in groups]
     for axis, (tag, title) in zip(figure.subplots(1, len(tags), squeeze=False).flat, tags.items(), strict=True):
-        _draw_groups(axis, groups, tag, range(len(groups)))
+        _draw_groups(axis, groups, tag, range(len(groups)), (1e6, f"{steps} (millions)"))
         axis.set_ylabel(title)
     if len(groups) > 1:
         _add_legend(figure, labels)
@@ -141,10 +141,11 @@ def draw_bars(groups: Mapping[str, Sequence[Bar]], title: str) -> "Figure":
     return figure
 
 
-def draw_adaptation(evaluation: Evaluated, where: object) -> "Figure":
+def draw_adaptation(evaluation: Evaluated, where: object, goal: int = 0) -> "Figure":
     """Draw return and success of every class against shots of adaptation, train classes first, then test classes.
 
-    Bands are the 95 % bootstrap intervals over episodes. Raises BidexError if the evaluation is not a meta-test;
+    Bands are the 95 % bootstrap intervals over tasks (of few tasks: episodes). ``goal`` is the number of steps of the
+    run; the title names it if the evaluation is of fewer steps. Raises BidexError if the evaluation is not a meta-test;
     ``where`` is its file, for the message.
     """
     if not isinstance(evaluation, MetaTestEvaluation):
@@ -157,6 +158,8 @@ def draw_adaptation(evaluation: Evaluated, where: object) -> "Figure":
             rows = [shot.classes[name] for shot in part.by_shot]
             _draw_shots(panels, rows, _COLOURS.get(split))
             panels[0].set_title(_plain(f"{split}: {name}"), fontsize=10)
+    if evaluation.steps is not None and evaluation.steps < goal:
+        figure.suptitle(f"meta-test after {evaluation.steps:,} of {goal:,} steps")
     return figure
 
 
@@ -247,7 +250,7 @@ def _draw_curve(axis: "Axes", curve: Curve | None, label: str, number: int, styl
 
 
 def _draw_groups(
-    axis: "Axes", groups: Sequence[Group], tag: str, numbers: Sequence[int], unit: tuple[float, str] = _MILLIONS
+    axis: "Axes", groups: Sequence[Group], tag: str, numbers: Sequence[int], unit: tuple[float, str]
 ) -> None:
     for (label, curves), number in zip(groups, numbers, strict=True):
         _draw_curve(axis, curves.get(tag), label, number, "-", unit[0])

@@ -16,6 +16,7 @@ from typing import TypeVar
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
+from torch.distributed.distributed_c10d import PrefixStore
 from torch.distributed.rendezvous import rendezvous
 
 from bidex_meta.errors import BidexError
@@ -28,6 +29,8 @@ TIMEOUT = timedelta(minutes=5)
 
 Value = TypeVar("Value")
 _attendance: Attendance | None = None
+_groups = 0
+"""Number of groups that this process has joined."""
 
 
 class LostProcess(RuntimeError):
@@ -64,7 +67,7 @@ def init_from_environment() -> None:
     Gloo sends tensors on the CPU, and NCCL sends tensors on CUDA devices. Raises LostProcess if a process does not
     join.
     """
-    global _attendance
+    global _attendance, _groups
     if "MASTER_ADDR" not in os.environ or int(os.environ.get("WORLD_SIZE", "1")) == 1 or _joined():
         return
     end_patiently()
@@ -75,6 +78,9 @@ def init_from_environment() -> None:
     atexit.register(_leave)
     with _collective():
         store, number, count = next(rendezvous("env://", timeout=TIMEOUT))
+        # The store outlives a group: the next one in these processes must not read its keys.
+        _groups += 1
+        store = PrefixStore(f"group {_groups}", store)
         dist.init_process_group(backend, store=store, rank=number, world_size=count, timeout=TIMEOUT)
         _attendance = Attendance(store, number, count)
 

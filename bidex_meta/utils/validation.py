@@ -80,7 +80,10 @@ def check_fields(settings: object, name: str, as_flags: bool = False, unresolved
 
 
 def refuse_unused(settings: Any, names: Collection[str], where: str) -> None:
-    """Raise BidexError if a field in ``names`` differs from its default, because it has no effect ``where`` it is."""
+    """Raise BidexError if a field in ``names`` differs from its default, because the field has no effect.
+
+    ``where`` says in which case these fields have no effect.
+    """
     for field in dataclasses.fields(settings):
         if field.name in names and getattr(settings, field.name) != field.default:
             raise BidexError(f"--{field.name.replace('_', '-')} has no effect {where}. Leave it out.")

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from bidex_meta.agents import Agent
+from bidex_meta.evaluation.play import agent_step
 from bidex_meta.rules import CONTROL_RATE
 from bidex_meta.world import World
 from bidex_meta.world.rendering import DrawnGhost, ghosts, pose, simulation
@@ -48,7 +49,8 @@ class Stage:
     @torch.no_grad()
     def step(self) -> None:
         """Take one control step in all environments; an environment whose episode ended begins the next one."""
-        self._obs, _, terminated, truncated, info = self._world.step(self._agent.eval_action(self._obs))
+        running = torch.ones(len(self.names), dtype=torch.bool, device=self._obs.device)
+        self._obs, _, terminated, truncated, info = agent_step(self._agent, self._world, self._obs, running)
         self._steps += 1
         self._returns += info["reward_unscaled"].double().cpu().numpy()
         self._success = info["running"]["success"].cpu().numpy().copy()

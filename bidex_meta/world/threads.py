@@ -28,9 +28,9 @@ def set_up_torch(threads: int, deterministic: bool = False) -> None:
     With ``deterministic`` torch only uses algorithms that repeat bit for bit on a GPU.
     """
     torch.set_num_threads(threads)
+    torch.use_deterministic_algorithms(deterministic)  # also off: another run in this process may have set it
     if deterministic:
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read when a GPU is first used
-        torch.use_deterministic_algorithms(True)
         # Filling new memory only serves to find bugs, and takes time.
         setattr(torch.utils.deterministic, "fill_uninitialized_memory", False)  # noqa: B010  # the stubs lack it
     keep_freed_memory()

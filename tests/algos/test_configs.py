@@ -49,8 +49,7 @@ TOGETHER: list[tuple[str, dict[str, Any], str]] = [
     ("ippo", {"popart": True, "share_parameters": True}, "popart needs a critic for each agent"),
     ("mappo", {"popart": True, "value_heads": False}, "leave value_heads on"),
     ("happo", {"agents": "thumbs"}, "agents: expected single"),
-    ("mtppo", {"init_std": 5.0}, r"mtppo: init_std: expected a number within std_range, 0.05 to 1.5, got 5.0"),
-    ("iql", {"init_std": 10.0}, "iql: init_std: expected a number within std_range"),
+    ("iql", {"init_std": 10.0}, r"iql: init_std: expected a number within std_range, 0.0067 to 7.4, got 10.0"),
     ("brc", {"critic_layer_norm": False}, "leave critic_layer_norm out"),
     ("flashsac", {"critic_layer_norm": False}, "leave critic_layer_norm out"),
 ]

@@ -1,5 +1,6 @@
 """``bidex-meta export``: the file does what torch does, says what it is, and what it cannot hold is refused."""
 
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -13,6 +14,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.experiments import exporting as export
 from bidex_meta.experiments.exporting import exported
 from bidex_meta.experiments.learners import learner_kind
+from bidex_meta.runs import RunFolder
 from bidex_meta.world.contract import ObservationGroup
 from tests.fakes import trained_run
 from tests.pages import ROOT
@@ -103,6 +105,21 @@ def test_a_run_exports_with_its_name_tag(shown, tmp_path: Path) -> None:
     assert "CatchUnderarm" in said["classes"] and said["versions"].startswith("{")
     (entry,) = model.graph.input
     assert entry.type.tensor_type.shape.dim[0].dim_param and entry.type.tensor_type.shape.dim[1].dim_value > 400
+
+
+def test_a_file_of_an_older_policy_or_a_damaged_one_is_not_pushed(shown, refused, tmp_path: Path) -> None:
+    run, hub = Path(shutil.copytree(trained_run("mtppo"), tmp_path / "run")), f"folder:{tmp_path / 'hub'}"
+    shown("export", run)
+    shown("push", run, f"folder:{tmp_path / 'first'}")
+    assert (tmp_path / "first" / "policy.onnx").is_file()
+    checkpoints = RunFolder.open(run).checkpoints
+    state, step = checkpoints.load()  # type: ignore[misc]
+    checkpoints.save(state, step + 8)
+    said = refused("push", run, hub)
+    assert f"expected the newest policy, of {step + 8} steps, got {step} steps. Write it again: bidex-meta" in said
+    (run / "policy.onnx").write_bytes((run / "policy.onnx").read_bytes()[:1000])
+    said = refused("push", run, hub)
+    assert "expected an ONNX file" in said and said.count("\n") == 1 and not (tmp_path / "hub").exists()
 
 
 def test_what_adapts_is_refused_in_one_line(refused, tmp_path: Path) -> None:

@@ -8,8 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 import bidex_meta
+from bidex_algos.offpolicy import mtsac
+from bidex_algos.onpolicy import mtppo
 from bidex_meta.cli import main
 from bidex_meta.config import RunConfig
 from bidex_meta.data import open_dataset
@@ -19,6 +22,7 @@ from bidex_meta.experiments.evaluating import FinalEvaluation, evaluate, meta_te
 from bidex_meta.experiments.plotting import plot
 from bidex_meta.experiments.recording import RecordConfig, record
 from bidex_meta.experiments.run_config import resolve
+from bidex_meta.experiments.run_data import implied
 from bidex_meta.experiments.sweep_plan import SweepPlan
 from bidex_meta.experiments.sweeping import sweep
 from bidex_meta.experiments.training import Event, Stopped, train
@@ -66,9 +70,13 @@ def test_a_resumed_run_is_that_of_an_unbroken_one(toy_worlds: None, tmp_path: Pa
     train(replace(half.config(), steps=48), resume=half)
     whole = train(CONFIG, run_dir=tmp_path / "whole")
     assert same(final(half), final(whole))
-    assert plot([half, whole.path], tmp_path / "curves.png").stat().st_size > 1000
+    for run in (half, whole.path):
+        assert plot([run], tmp_path / "curves.png").stat().st_size > 1000
     with pytest.raises(BidexError, match=r"--seed is 0 in .*half, not 1: a resumed run keeps its config"):
         train(replace(half.config(), seed=1), resume=str(half.path))
+    with pytest.raises(BidexError, match="has trained for 48 steps, expected --steps of at least that, got 24"):
+        train(replace(half.config(), steps=24), resume=half)
+    assert half.config().steps == 48
     with pytest.raises(BidexError, match="continues in the run's own folder"):
         train(CONFIG, run_dir=tmp_path / "other", resume=half)
     with pytest.raises(BidexError, match="Expected a config or a run to resume"):
@@ -79,6 +87,7 @@ def test_a_resolved_config_is_complete_and_stays_as_it_is() -> None:
     config = resolve(RunConfig(suite="mt4-v2", learner={"gamma": 0.9}, seed=3))
     assert config.suite == "MT4-v2" and config.learner.gamma == 0.9 and config.num_envs > 0 < config.steps
     assert None not in (config.num_envs, config.steps, config.threads) and resolve(config) == config
+    assert resolve(RunConfig(suite="MT4", learner=mtppo.PRESETS["paper"], device="cpu")).preset == "paper"
 
 
 @pytest.mark.parametrize(("suite", "algo", "rows"), [("ML1-Switch-v2", "rl2", 16), ("ML4-v2", "varibad", 48)])
@@ -90,7 +99,10 @@ def test_learners_of_whole_trials_take_few_environments_of_each_class(suite: str
     ("change", "expected"),
     [
         ({"suite": None}, "Name what to train on"),
-        ({"learner": {"gama": 0.9}}, "sets gama, which"),
+        ({"learner": {"gama": 0.9}}, "Did you mean 'gamma'?"),
+        ({"learner": {1: 2}}, "expected names of options, got 1"),
+        ({"learner": None}, "expected a MTPPOConfig or a mapping of options, got None"),
+        ({"learner": mtsac.PRESETS["laptop"]}, "expected a MTPPOConfig or a mapping of options"),
         ({"learner": {"gamma": 9.0}}, "gamma"),
         ({"algo": "mtpp"}, "Did you mean 'mtppo'"),
         ({"num_envs": 3}, "at least 4"),
@@ -137,6 +149,8 @@ def test_a_sweep_of_configs_is_trained_once_and_resumed(toy_worlds: None, tmp_pa
         sweep(SweepPlan.of(tmp_path / "gammas", {"g0.9": gamma_config(0.8)}))
     with pytest.raises(BidexError, match="Expected the name of a folder"):
         SweepPlan.of(tmp_path, {"../up": CONFIG})
+    with pytest.raises(BidexError, match="Expected the name of a folder"):
+        SweepPlan.of(tmp_path, {"..": CONFIG})
 
 
 def gamma_config(gamma: float) -> RunConfig:
@@ -153,6 +167,22 @@ def test_a_data_set_is_that_of_the_command(tmp_path: Path) -> None:
     assert found.num_steps == other.num_steps >= 20
     with pytest.raises(BidexError, match="record random takes no run folders, got 1"):
         record(RecordConfig("random", runs=(tmp_path,)))
+
+
+def test_the_policy_of_a_run_is_recorded_on_the_tasks_of_the_run(tmp_path: Path) -> None:
+    pytest.importorskip("h5py", reason="needs the extra data")
+    small = replace(CONFIG, suite="MT1-Switch-v2", tasks_per_class=2)
+    run = train(small, run_dir=tmp_path / "r")
+    settings = RecordConfig("medium", (run.path,), size=500, num_envs=4, device="cpu", threads=1, out=tmp_path / "d-v0")
+    found = record(settings)
+    assert set(found.table["task_index"].tolist()) == {0, 1}
+    assert implied([found])["tasks_per_class"] == 2
+
+
+def test_a_run_leaves_torch_as_the_next_one_needs_it(toy_worlds: None, tmp_path: Path) -> None:
+    for number, deterministic in enumerate((True, False)):
+        train(replace(CONFIG, deterministic=deterministic), run_dir=tmp_path / str(number))
+        assert torch.are_deterministic_algorithms_enabled() is deterministic
 
 
 def test_a_transfer_needs_held_out_classes_and_ppo(toy_worlds: None, tmp_path: Path) -> None:

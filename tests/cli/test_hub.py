@@ -21,6 +21,8 @@ MT20 = ROOT / "results" / "MT20-dagger-seed0"
 def test_a_policy_goes_through_a_folder_and_plays(shown, refused, tmp_path: Path) -> None:
     hub, out = f"folder:{tmp_path / 'hub'}", tmp_path / "mine"
     assert shown("push", HAND_OVER, hub) == f"bidex-meta pull {hub}\n"
+    card = (tmp_path / "hub" / "README.md").read_text()
+    assert "bidex-meta pull folder:hub --out policy" in card and str(tmp_path) not in card
     assert "is not empty" in refused("push", HAND_OVER, hub)
     assert shown("pull", hub, "--out", out) == f"{out}\n"
     assert "is not empty" in refused("pull", hub, "--out", out)
@@ -42,6 +44,29 @@ def test_a_card_is_made_from_the_run_and_read_by_the_hub(shown, tmp_path: Path) 
     row, versions = classes["HandOver"], json.loads((MT20 / "versions.json").read_text())
     assert f"| HandOver | {100 * row['success']:.1f} % | {row['return']:.4g} |" in card.text
     assert f"| commit | {versions['git']['commit'][:6]}" in card.text
+
+
+@pytest.mark.parametrize("steps", [3489791, None])
+def test_a_card_has_no_results_of_another_checkpoint(shown, tmp_path: Path, steps: int | None) -> None:
+    run = Path(shutil.copytree(HAND_OVER, tmp_path / "run"))
+    _damage(run / "evaluation.json", "steps", steps)
+    shown("push", run, f"folder:{tmp_path / 'hub'}")
+    card = (tmp_path / "hub" / "README.md").read_text()
+    assert "results are left out, because evaluation.json is not of the newest checkpoint" in card
+    assert "model-index" not in card and "| HandOver | " not in card and "evaluated on" not in card
+    assert "| steps | 3,489,792 |" in card
+
+
+def test_a_card_names_steps_split_and_randomisation_of_its_results(shown, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(HAND_OVER, tmp_path / "run"))
+    shown("push", run, f"folder:{tmp_path / 'usual'}")
+    assert "of the policy of 3,489,792 steps on HandOver:\n" in (tmp_path / "usual" / "README.md").read_text()
+    _damage(run / "evaluation.json", "split", "test")
+    _damage(run / "evaluation.json", "randomisation", {"action_noise": 1.0})
+    shown("push", run, f"folder:{tmp_path / 'hub'}")
+    card = (tmp_path / "hub" / "README.md").read_text()
+    assert "of the policy of 3,489,792 steps on HandOver, split test, randomised:\n" in card
+    assert '"dataset": {"name": "HandOver, split test, randomised", "type": "HandOver"}' in card
 
 
 def test_without_a_network_the_cache_of_the_hub_serves(shown, refused, tmp_path: Path, monkeypatch) -> None:

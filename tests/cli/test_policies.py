@@ -1,5 +1,6 @@
 """From a checkpoint to its policy."""
 
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,7 +15,7 @@ from bidex_meta.rules import V1, V2
 from bidex_meta.runs import RunFolder
 from bidex_meta.utils import paths
 from bidex_meta.worlds import open_worlds
-from tests.fakes import trained_run
+from tests.fakes import change, trained_run
 
 
 @pytest.mark.parametrize("run", ["mtppo", "mtsac", "promp", "rl2"])
@@ -55,6 +56,16 @@ def test_a_policy_in_worlds_of_other_rules_is_noted(tmp_path: Path, caplog: pyte
     caplog.clear()
     looked_at(LookFlags(policy="zero", suite="MT4-v2"))
     assert not caplog.messages
+
+
+def test_a_run_is_shown_with_its_own_tasks_unless_a_seed_is_named(tmp_path: Path) -> None:
+    run = Path(shutil.copytree(trained_run("mtppo"), tmp_path / "run"))
+    assert [looked_at(LookFlags(run=run, seed=seed))[0].seed for seed in (None, 0, 5)] == [3, 0, 5]
+    change(run, task_seed=7, tasks_per_class=2)
+    worlds, *_ = looked_at(LookFlags(run=run))
+    assert worlds.seed == 7 and {*worlds.train_tasks().values()} == {2}
+    assert {*looked_at(LookFlags(run=run, suite="MT4-v2"))[0].train_tasks().values()} != {2}
+    assert looked_at(LookFlags(task="HandOver"))[0].seed == 0
 
 
 def test_a_class_may_be_named_with_the_version_of_its_suite() -> None:

@@ -67,6 +67,11 @@ def test_a_run_is_filmed_with_all_its_classes_beside_each_other(monkeypatch, toy
         (["--task", "Near"], "--out film.mp4"),
         (["--task", "Near", "--out", "a.mp4", "--every", "-1"], "every"),
         ([str(path), "--checkpoint", "best"], "no best.pt"),
+        ([str(path), "--policy", "random"], "--policy has no effect with a run folder, which is the policy."),
+        (["--task", "Near", "--checkpoint", "best", "--out", "a.png"], "--checkpoint has no effect without a run"),
+        ([str(path), "--large"], "--large has no effect without --tiled"),
+        ([str(path), "--tiled", "--task", "Near"], "--task has no effect with --tiled, which shows all classes"),
+        (["--suite", "MT4", "--tiled", "--task", "Near", "--out", "a.png"], "--task has no effect with --tiled"),
     ):
         assert main(["render", *flags]) == 2
         assert told in capsys.readouterr().err

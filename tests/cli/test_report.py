@@ -98,13 +98,45 @@ def test_runs_without_an_evaluation_and_of_one_seed(runs, report):
     assert "No table: " in report(runs[:1])
 
 
-def test_a_meta_test_is_drawn(runs, report):
+def test_a_meta_test_is_drawn(runs, report, shown):
     measures = {"success": 0.5, "return": 2.0, "score": None, "success_interval": [0.4, 0.6], "return_interval": None}
     shots = {"classes": {"A": measures}}
     played = {"shots": 1, "rollouts": 2, "trials": 1}
     splits = {"train": {**played, "before": shots, "after": shots, "by_shot": [shots, shots]}}
     (runs[0] / "evaluation.json").write_text(json.dumps({"splits": splits}))
-    assert "over shots" in report(runs[:1])
+    text = report(runs[:1])
+    assert "over shots" in text and "over tasks (of few: episodes)" in text
+    assert "meta-test after" not in pictures(text)
+    (runs[0] / "evaluation.json").write_text(json.dumps({"splits": splits, "steps": 500}))
+    assert "meta-test after 500 of 1,000 steps" in pictures(report(runs[:1]))
+    shown("plot", runs[0], "--adaptation", "--out", runs[0] / "a.svg")
+    assert "meta-test after 500 of 1,000 steps" in (runs[0] / "a.svg").read_text()
+
+
+def pictures(text: str) -> str:
+    """The text of all vector drawings of a page."""
+    return "".join(base64.b64decode(each).decode() for each in re.findall(r"image/svg\+xml;base64,([^\"]*)", text))
+
+
+def test_updates_are_no_environment_steps(tmp_path, report):
+    path = evaluated_run(tmp_path, 0, {"A": 0.5}, "bc")
+    log(path, *ROWS)
+    text = report([path])
+    assert {"1,000 updates", "850 updates"} < {*Tags(text).cells}
+    assert "gradient updates / s" in pictures(text) and "environment steps" not in pictures(text)
+
+
+def test_an_unusual_evaluation_is_named(runs, report):
+    found = json.loads((runs[0] / "evaluation.json").read_text())
+    (runs[0] / "evaluation.json").write_text(json.dumps(found | {"split": "test"}))
+    assert "Evaluation of A mtppo: split test." in report(runs[:1])
+
+
+def test_the_newest_film_is_that_of_the_latest_step(runs, report):
+    for step, content in ((1000, b"newest"), (500, b"copied later"), (800, b"and this")):
+        (runs[0] / "videos" / f"training_{step}.mp4").write_bytes(content)
+    films = [a["src"] for tag, a in Tags(report(runs[:1])).elements if tag == "video"]
+    assert [base64.b64decode(film.partition(",")[2]) for film in films] == [b"newest"]
 
 
 def test_large_films_are_named_alone(runs, monkeypatch, report):

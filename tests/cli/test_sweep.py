@@ -201,20 +201,35 @@ def test_one_sweep_works_in_a_folder_and_a_changed_file_is_noticed(file: Path, t
     run = SweepPlan.read(file).runs[0]
     others = replace(run, final=FinalEvaluation(other_tasks=True))
     assert (state(run, CONFIG).state, state(others, CONFIG).state) == ("done", "left"), "it is evaluated again"
+    with pytest.raises(BidexError, match="has trained for 6 steps, expected at most 3"):
+        state(run, replace(CONFIG, steps=3))
+    limited = replace(CONFIG, steps=100, minutes=0.5)
+    assert state(run, limited).state == "left", "it had no time limit and six steps before"
 
 
 def test_an_evaluation_has_the_parts_that_a_file_asks_for() -> None:
-    row = {"classes": {"A": {"success": 0.5, "return": 1.0}}}
-    part = {"shots": 2, "rollouts": 1, "trials": 1, "before": row, "after": row, "by_shot": [row]}
-    found = parse_evaluation({"splits": {"train": part, "test": part}}, "here")
+    splits = {}
+    for split, tasks in (("train", 3), ("test", 1)):
+        row = {"episodes_per_task": 4, "classes": {"CatchUnderarm": {"success": 0.5, "return": 1.0, "tasks": tasks}}}
+        splits[split] = {"shots": 2, "rollouts": 7, "trials": 1, "before": row, "after": row, "by_shot": [row]}
+    found = parse_evaluation({"splits": splits}, "here")
+    run = PlannedRun(Path("x"), CONFIG, "x", config=run_config(suite="ML1", algo="rl2", seed=0))
     for final, done in (
+        (FinalEvaluation(rollouts=7, episodes=4, tasks=3), True),
+        (FinalEvaluation(tasks=50), True),  # ML1 has three train tasks and one test task
+        (FinalEvaluation(tasks=2), False),
+        (FinalEvaluation(rollouts=8), False),
+        (FinalEvaluation(episodes=5), False),
         (FinalEvaluation(), True),
         (FinalEvaluation(split="test", shots=2), True),
         (FinalEvaluation(split="unseen"), False),
         (FinalEvaluation(shots=1), False),
         (FinalEvaluation(hidden_rewards=True), False),
     ):
-        assert _played(final, found) is done
+        assert _played(replace(run, final=final), found) is done
+    one = parse_evaluation({"policy": row}, "here")
+    for episodes, done in ((None, True), (4, True), (3, False)):
+        assert _played(replace(run, final=FinalEvaluation(episodes=episodes)), one) is done
 
 
 @pytest.mark.parametrize(

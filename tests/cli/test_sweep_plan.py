@@ -129,6 +129,8 @@ TOO_FEW = (
     ('arms = [{ name = "x", algo = "maml", suites = ["ML4-v2"] }]', "has 2 environments for 3 tasks of a meta-batch"),
 )
 """Arms of learners that need more environments than FILE has."""
+TWICE = 'arms = [{ name = "x", algo = "ppo" }, { name = "y", algo = "ppo", overrides = { shots = 3 } }]'
+"""Two arms with the same config; the second has an evaluation that its learner does not support."""
 
 
 def test_what_run_would_refuse_is_told_before_anything_begins(tmp_path: Path, monkeypatch, refused) -> None:
@@ -136,9 +138,11 @@ def test_what_run_would_refuse_is_told_before_anything_begins(tmp_path: Path, mo
     for change, told in (
         (('["ppo"]', '["ppoo"]'), "ppoo on HandOver: Unknown algo 'ppoo'"),
         (('"HandOver"', '"HandOvr"'), "Unknown task 'HandOvr'"),
-        (("steps = 6", 'learner = { gama = "x" }'), "sets gama, which this version of ppo does not have"),
+        (("steps = 6", 'learner = { gama = "x" }'), "Did you mean 'gamma'?"),
         (("steps = 6", "learner = { gamma = 3.0 }"), "gamma"),
         *[(('algos = ["ppo"]', line), told) for line, told in TOO_FEW],
+        (('["ppo"]', '["promp"]'), "promp adapts to hidden goals, but HandOver shows them"),
+        (('algos = ["ppo"]', TWICE), "--shots is for learners that adapt"),
     ):
         Path("s.toml").write_text(FILE.replace(*change))
         error = refused("sweep", "s.toml")

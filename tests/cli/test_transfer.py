@@ -115,9 +115,11 @@ def test_other_tasks_in_the_same_folder_are_refused(pair: Path, tmp_path: Path) 
 
 def test_points_and_objects_of_a_suite_are_kept(pair: Path, tmp_path: Path) -> None:
     thrown = '{ name = "CatchUnderarm", split = "test", objects = ["mug", "block"] },\n]'
-    pair.write_text(SUITE.replace("]\n", f"    {thrown}\npoints = {{ count = 32, kinds = true }}\ntouch = true\n"))
+    more = "points = { count = 32, kinds = true }\ntouch = true\nrandomisation = { friction = [0.5, 1.5] }\n"
+    pair.write_text(SUITE.replace("]\n", f"    {thrown}\n{more}"))
     suite = opened(suite_file(opened(pair), "CatchUnderarm-mug", tmp_path)).suite
-    assert suite and (suite.points, suite.point_kinds, suite.touch) == (32, True, True)
+    assert suite and suite.randomisation == load_suite(pair).randomisation is not None
+    assert (suite.points, suite.point_kinds, suite.touch) == (32, True, True)
     assert [entry.name for entry in suite.split_classes("train")] == ["CatchUnderarm-mug"]
     assert [entry.name for entry in suite.split_classes("test")][-1] == "CatchUnderarm-block"
 

@@ -52,6 +52,20 @@ def test_a_run_is_equal_within_or_different(run, capsys):
     assert verify(capsys, run)[0] == 1
 
 
+def test_other_tasks_are_verified_and_the_random_policy_is_named(run, capsys):
+    assert main(["evaluate", str(run), "--other-tasks", "--random", "--json", "--episodes", "2"]) == 0
+    (run / "evaluation.json").write_text(capsys.readouterr().out)
+    code, shown = verify(capsys, run)
+    assert code == 0 and "4 classes: 4 equal bit for bit" in shown.out and "Far (other tasks)" in shown.out
+    assert "Not verified: random policy, means over classes, intervals." in shown.out
+    changed(run, lambda found: found["other_tasks"]["policy"]["classes"]["Far"].update({"return": 99.0}))
+    code, shown = verify(capsys, run, "--json")
+    found = json.loads(shown.out)
+    assert (code, found["equal"], found["classes"]["Far (other tasks)"]["outcome"]) == (1, 3, "differs")
+    changed(run, lambda found: found["other_tasks"].pop("task_seed"))
+    assert "other_tasks.task_seed: expected it to be there" in verify(capsys, run)[1].err
+
+
 def test_another_policy_is_found(run, capsys):
     checkpoints = RunFolder.open(run).checkpoints
     state, step = checkpoints.load()  # type: ignore[misc]
@@ -179,7 +193,13 @@ def test_rows_that_cannot_agree():
     more = {name: replace(row, episodes=40) for name, row in rows.items()}
     single = {name: replace(row, return_interval=None) for name, row in rows.items()}
     other = {name: replace(row, mean_return=row.mean_return + 1e-6) for name, row in single.items()}
-    for pair, outcome in (((rows, rows), "equal"), ((rows, more), "differs"), ((single, other), "differs")):
+    once = {name: replace(row, success_once=0.1, success_at_end=0.2) for name, row in rows.items()}
+    never = {name: replace(row, success_at_end=0.9) for name, row in once.items()}
+    scored = {name: replace(row, score=90.0) for name, row in rows.items()}
+    rescored = {name: replace(row, score=80.0) for name, row in rows.items()}
+    pairs = [((rows, rows), "equal"), ((rows, more), "differs"), ((single, other), "differs")]
+    pairs += [((once, once), "equal"), ((never, once), "differs"), ((scored, rescored), "within")]
+    for pair, outcome in pairs:
         assert [each.outcome for each in agreements(*pair)] == [outcome] * 2
     with pytest.raises(BidexError, match="of C0, got C0, C1"):
         agreements(rows, {"C0": rows["C0"]})

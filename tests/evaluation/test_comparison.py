@@ -8,6 +8,7 @@ import pytest
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import over_runs, read_groups, read_histories, score_over, success_over
+from bidex_meta.experiments.plotting import plot
 from bidex_meta.runs import RunFolder
 from tests.fakes import change, evaluated_run, log
 
@@ -98,6 +99,29 @@ def test_versions_of_the_rules_are_not_compared(tmp_path: Path):
     assert success_over(second, first) is not None and score_over(second, first) is not None
 
 
+def test_the_suite_names_the_version_of_an_evaluation_that_does_not(tmp_path: Path):
+    """An evaluation of version 2 from before ``episode_steps``; no score of version 1 is computed for it."""
+    old, new = (
+        change(evaluated_run(tmp_path, seed, {"HandOver": 0.5}, gamma=seed / 10), base="moving") for seed in (1, 2)
+    )
+    change(new, suite="MT20-v2")
+    told(new, policy={"classes": {"HandOver": {"success": 0.5, "return": 5.0}}})
+    first, second = groups(old, new)
+    assert (first.version, second.version, second.scores) == (1, 2, None)
+    assert success_over(second, first) is None
+    alone = evaluated_run(tmp_path, 3, {"HandOver": 0.5}, "ppo", task="HandOver-v2")
+    assert groups(alone)[0].version == 2
+
+
+def test_an_unusual_evaluation_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path = told(evaluated_run(tmp_path, 0, {"A": 0.5}), split="test", randomisation={"action_noise": 1.0})
+    usual = evaluated_run(tmp_path, 1, {"A": 0.5}, "mttrpo")
+    assert main(["compare", str(path), str(usual)]) == 0
+    assert "Evaluation of mtppo: split test, randomised." in capsys.readouterr().out
+    assert main(["compare", str(path), str(usual), "--json"]) == 0
+    assert [group["settings"] for group in json.loads(capsys.readouterr().out)] == [["split test", "randomised"], []]
+
+
 def test_data_sets_called_as_their_class_leave_classes_one_group(tmp_path: Path):
     paths = [
         change(
@@ -180,6 +204,8 @@ def test_steps_are_the_mean_over_seeds_that_time_ended_with_their_range(tmp_path
         ({"stop_at_score": 33.0}, {"Eval/score": 34.0}, True),
         ({"stop_at_success": 0.8}, {"Train/success_rate": 0.79}, False),
         ({"stop_at_success": 0.8}, {"Train/success_rate": 0.8}, True),
+        ({"stop_at_success": 0.8}, {"Train/success_rate": 0.8, "Train/episodes": 99.0}, False),
+        ({"stop_at_success": 0.8}, {"Train/success_rate": 0.8, "Train/episodes": 100.0}, True),
     ],
 )
 def test_a_run_that_time_or_a_mark_ended_is_of_the_steps_it_made(tmp_path: Path, ends, metrics, over):
@@ -245,6 +271,31 @@ def test_runs_are_grouped_whether_evaluated_or_not(tmp_path: Path):
     assert list(first.curves) == ["Train/success/A"]
     with pytest.raises(BidexError, match="has no metrics to draw yet"):
         read_histories([log(paths[0])])
+
+
+def test_a_run_is_not_counted_twice(tmp_path: Path):
+    paths = [evaluated_run(tmp_path / name, seed, {"A": 0.5}) for name, seed in (("a", 0), ("b", 1), ("c", 1))]
+    rows = [{"step": step, "time": step / 7, "Train/success/A": 0.1} for step in range(1, 9)]
+    whole, snapshot = log(paths[0], *rows), log(paths[1], *rows[:4])
+    for runs in ([whole, snapshot], [snapshot, whole]):
+        with pytest.raises(BidexError, match="counts as one seed"):
+            read_histories(runs)
+    log(paths[1], {"step": 1, "time": 3.0, "Train/success/A": 0.1})
+    other = log(paths[2], {"step": 1, "time": 4.0, "Train/success/A": 0.1})
+    with pytest.raises(BidexError, match="second run of mtppo with seed 1 on MT4"):
+        read_histories([whole, snapshot, other])
+
+
+@pytest.mark.parametrize(
+    ("algos", "told"),
+    [(["bc", "iql"], "gradient updates"), (["mtppo"], "environment steps"), (["bc", "mtppo"], "environment steps, or")],
+)
+def test_steps_of_learners_on_data_are_updates(tmp_path: Path, algos: list[str], told: str):
+    runs = [RunFolder.open(evaluated_run(tmp_path, 0, {"A": 0.5}, algo)) for algo in algos]
+    for run in runs:
+        log(run.path, {"step": 5, "Train/success/A": 0.1, "Train/return/A": 1.0})
+    plot(runs, tmp_path / "a.svg")
+    assert f"<!-- {told}" in (tmp_path / "a.svg").read_text()
 
 
 def test_plot_takes_several_runs_and_compare_draws(tmp_path: Path, capsys, monkeypatch):

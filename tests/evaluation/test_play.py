@@ -8,8 +8,8 @@ import torch
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import filming
 from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
-from bidex_meta.evaluation.filming import film_tiles
-from bidex_meta.evaluation.play import RandomAgent, ZeroAgent, evaluate
+from bidex_meta.evaluation.filming import film_row, film_tiles
+from bidex_meta.evaluation.play import RandomAgent, ZeroAgent, evaluate, play_tasks
 from bidex_meta.evaluation.references import Reference
 from bidex_meta.evaluation.results import MANY_TASKS, ClassResult, Evaluation, compare
 from bidex_meta.experiments.metatest import Options
@@ -159,6 +159,32 @@ def test_score_needs_both_references_and_all_classes():
     both = Evaluation({"A": scored, "B": result([1.0])}, 2).to_json()
     assert both["aggregate"]["score"] is None
     assert both["classes"]["A"]["score"] == pytest.approx(25.0)
+
+
+class Watcher(ZeroAgent):
+    """Keeps the transitions that it is shown."""
+
+    def __init__(self, world: Any) -> None:
+        super().__init__(world.action_space)
+        self.seen: list[Any] = []
+
+    def observe(self, timestep: Any) -> None:
+        self.seen.append((timestep.reward.tolist(), timestep.valid.tolist(), timestep.next_observation.tolist()))
+
+
+@pytest.mark.parametrize("tiled", [True, False])
+def test_a_film_shows_the_agent_the_transitions_that_an_evaluation_shows(tiled: bool) -> None:
+    """Until the first episode ends; without tiles also after it, where ended episodes have no valid transitions."""
+    world: Any = ToyWorld(5, "DISABLED")
+    evaluated, filmed = Watcher(world), Watcher(world)
+    play_tasks(evaluated, world, 1, seed=0)
+    steps = min(STEPS_OF_TASK) if tiled else max(STEPS_OF_TASK)
+    longest = int(world.max_episode_steps.argmax())
+    if tiled:
+        list(film_tiles(filmed, world, [0, 1], steps, seed=0, width=8, height=6))
+    else:
+        list(film_row(filmed, world, longest, steps, seed=0, width=8, height=6))
+    assert len(filmed.seen) == steps and filmed.seen == evaluated.seen[:steps]
 
 
 @pytest.mark.parametrize("at_end", [True, False])

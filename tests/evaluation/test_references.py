@@ -1,11 +1,14 @@
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import references
+from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED
+from bidex_meta.evaluation.play import evaluate
 from bidex_meta.evaluation.references import Reference
 from bidex_meta.experiments import baselines
 from bidex_meta.runs.evaluations import ClassSummary
@@ -76,6 +79,21 @@ def test_baseline_measures_every_class_and_stores_what_it_printed(
         assert row["episodes"] == printed[name.removesuffix(ending)]["episodes"] > 0
         assert row["made"]["policy"].startswith({"random": "uniform", "zero": "zero"}[what])
         assert row["made"]["suite"] == suite and row["made"]["versions"]["packages"]["mujoco"]
+
+
+@pytest.mark.parametrize("what", ["random", "zero"])
+def test_the_seed_of_a_baseline_draws_its_starts(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seed 0 keeps the starts of the stored references."""
+    monkeypatch.setattr(OwnSuite, "world", lambda source: ToyWorld(6, "DISABLED"))
+    seeds: list[int] = []
+
+    def spy(*given: Any, seed: int, **options: Any) -> Any:
+        seeds.append(seed)
+        return evaluate(*given, seed=seed, **options)
+
+    monkeypatch.setattr(baselines, "evaluate", spy)
+    found = [baselines.baseline(what, "MT4", episodes=1, seed=seed).classes["Near"].returns for seed in (0, 7)]
+    assert seeds == [EVALUATION_SEED, EVALUATION_SEED + 7] and list(found[0]) != list(found[1])
 
 
 def test_a_baseline_without_out_writes_nothing(

@@ -57,6 +57,17 @@ def test_a_stage_plays_on_and_counts_episodes(stage, world, monkeypatch):
     assert (stage.status()["class"], stage.status()["episodes"]) == (world.task_names[0], "0 of 4 solved")
 
 
+def test_a_stage_shows_the_agent_every_transition(world):
+    seen = []
+    agent = ZeroAgent(world.action_space)
+    agent.observe = seen.append  # type: ignore[attr-defined]
+    stage = Stage(world, agent)
+    stage.step()
+    stage.step()
+    assert [timestep.valid.tolist() for timestep in seen] == [[True] * 4] * 2
+    assert torch.equal(seen[0].next_observation, seen[1].observation)
+
+
 def test_a_tour_goes_to_the_next_class_after_each_episode(world):
     stage = Stage(world, ZeroAgent(world.action_space), row=3, tour=True)
     lengths = [int(most) for most in world.max_episode_steps]

@@ -18,7 +18,7 @@ from bidex_algos.nets.policy import GaussianPolicy, gaussian_policy, of_head
 from bidex_algos.rollout import EpisodeStatistics, Rollout, collect
 from bidex_meta.training.distributed import all_sum, world_size
 from bidex_meta.training.learner import Capability, LearnerConfig, Parts, State
-from bidex_meta.utils.validation import Count, Fraction, Positive, Widths, check_rising, check_within
+from bidex_meta.utils.validation import Count, Fraction, Positive, Widths, check_rising
 from bidex_meta.world.contract import VectorWorld
 
 _VALUE_HORIZON = 100.0  # iterations over which old returns fade from the statistics that define the critic's units
@@ -51,7 +51,6 @@ class OnPolicyConfig(LearnerConfig):
         super().__post_init__()
         check_networks(self)
         check_rising(self, self.algo, "std_range")
-        check_within(self, self.algo, "init_std", "std_range")
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """Estimate the memory that the learner takes, in bytes, if it stores ``width`` numbers per environment step."""

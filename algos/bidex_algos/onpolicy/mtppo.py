@@ -19,7 +19,6 @@ from bidex_algos.onpolicy.demonstrations import Demonstrations
 from bidex_algos.onpolicy.lessons import Lessons
 from bidex_algos.onpolicy.ppo import NAMES, AdaptiveAdams, PolicyLoss, mini_batches, policy_loss
 from bidex_algos.rollout import check_samples
-from bidex_meta.errors import BidexError
 from bidex_meta.training.distributed import sum_gradients, world_size
 from bidex_meta.training.learner import NO_SOURCES, Capability, Parts, Sources, State
 from bidex_meta.utils.validation import Count, Positive, Whole, check_rising
@@ -95,8 +94,6 @@ class MTPPO(OnPolicy):
 
     def __init__(self, world: VectorWorld, config: MTPPOConfig, seed: int, sources: Sources = NO_SOURCES):
         sources.check(self.name, "demonstrations", "teachers")
-        if config.demonstration_cloning and sources.demonstrations is None:
-            raise BidexError(f"{self.name}: demonstration_cloning needs --demonstrations; add them, or leave it out.")
         check_samples(self.name, config.rollout_steps, world.num_envs, config.num_minibatches)
         super().__init__(world, config, seed)
         self.adams = AdaptiveAdams(
