@@ -264,10 +264,7 @@ class Benchmark:
         return tasks
 
     def _env_classes(self, split: Split) -> dict[str, type[SuiteEnv]]:
-        if self.suite.base == "moving":
-            moving = True
-        else:
-            moving = None
+        moving = True if self.suite.base == "moving" else None
         hides = self.suite.observation == "masked"
         points = (self.suite.points, self.suite.point_kinds)
         classes = dict[str, type[SuiteEnv]]()

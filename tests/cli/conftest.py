@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from bidex_meta.cli import main
+from bidex_meta.evaluation import statistics
 from bidex_meta.experiments import learners
 from bidex_meta.utils import waiting
 from bidex_meta.worlds.own import OwnSuite
@@ -113,3 +114,8 @@ def adapted_once(tmp_path_factory) -> Path:
 def adapted(adapted_once, finder, tmp_path) -> Path:
     """An evaluated run of ``finder``."""
     return shutil.copytree(adapted_once, tmp_path / "r")
+
+
+@pytest.fixture
+def few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(statistics, "RESAMPLES", 100)

@@ -7,10 +7,9 @@ without rows are tried beside what they concern: tests/runs, tests/robust, tests
 import copy
 import pickle
 import random
-from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -26,190 +25,23 @@ from bidex_meta.data.part_files import Episode
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import evaluate
 from bidex_meta.metaworld import vector_envs
-from bidex_meta.metaworld.adapters import MetaWorldEnvs
 from bidex_meta.utils import gl_backend
 from bidex_meta.world import World
 from bidex_meta.world.wrapper import NumpyWorld
-from tests.points import PointWorld, ring
+from tests.clients.every_client import (
+    CLIENTS,
+    LIMITS,
+    NAME,
+    ROWS,
+    SINGLES,
+    VECTORS,
+    actions,
+    client,
+    numbers,
+    points,
+)
+from tests.points import PointWorld
 from tests.world.play import class_world, suite_world
-
-NAME = "CatchUnderarm-v2"
-ID = f"bidex-meta/{NAME}"
-ROWS = 4
-LIMITS = (5, 7)
-
-
-class Told(NamedTuple):
-    """What a library's user sees of a step, each (n, ...)."""
-
-    obs: np.ndarray
-    """What the policy acts on next."""
-    terminated: np.ndarray
-    truncated: np.ndarray
-    final: np.ndarray | None
-    """Where an episode ended, its last observation, from the place where the library looks for it."""
-    raw: Any
-    """All that the step returned."""
-
-
-class Client(NamedTuple):
-    """One library's adapter around a world."""
-
-    reset: Callable[[int | None], np.ndarray]
-    step: Callable[[np.ndarray], Told]
-    close: Callable[[], object]
-
-
-def numbers(value: Any) -> np.ndarray:
-    return np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
-
-
-def of_world(world: Any) -> Client:
-    def step(action: np.ndarray) -> Told:
-        obs, reward, terminated, truncated, info = world.step(torch.from_numpy(action))
-        flags = numbers(terminated), numbers(truncated)
-        return Told(numbers(obs), *flags, numbers(info["final_obs"]), (obs, reward, *flags, info))
-
-    return Client(lambda seed: numbers(world.reset(seed=seed)[0]), step, world.close)
-
-
-def of_numpy(world: Any) -> Client:
-    env = NumpyWorld(world)
-
-    def step(action: np.ndarray) -> Told:
-        obs, reward, terminated, truncated, info = env.step(action)
-        final = obs.copy()
-        for row in np.flatnonzero(info.get("_final_obs", [])):
-            final[row] = info["final_obs"][row]
-        return Told(obs, terminated, truncated, final, (obs, reward, terminated, truncated, info))
-
-    return Client(lambda seed: env.reset(seed=seed)[0], step, env.close)
-
-
-def of_sb3(world: Any) -> Client:
-    env = import_module("bidex_meta.clients.sb3_env").SB3VecEnv(world)
-
-    def reset(seed: int | None) -> np.ndarray:
-        if seed is not None:
-            env.seed(seed)
-        return env.reset()
-
-    def step(action: np.ndarray) -> Told:
-        obs, reward, dones, infos = env.step(action)
-        cut = np.array([info.get("TimeLimit.truncated", False) for info in infos])
-        final = np.stack([info.get("terminal_observation", obs[row]) for row, info in enumerate(infos)])
-        return Told(obs, dones & ~cut, cut, final, (obs, reward, dones, infos))
-
-    return Client(reset, step, env.close)
-
-
-def of_rsl_rl(world: Any) -> Client:
-    env = import_module("bidex_meta.clients.rsl_rl_env").RslRlVecEnv(world)
-
-    def step(action: np.ndarray) -> Told:
-        obs, reward, dones, extras = env.step(torch.from_numpy(action))
-        cut = extras["time_outs"]
-        raw = obs.to_dict(), reward, dones, extras
-        return Told(numbers(obs["policy"]), numbers(dones & ~cut), numbers(cut), None, raw)
-
-    return Client(lambda seed: numbers(env.reset(seed)[0]["policy"]), step, world.close)
-
-
-def of_skrl(world: Any) -> Client:
-    env: Any = None
-
-    def reset(seed: int | None) -> np.ndarray:
-        nonlocal env
-        if env is None or seed is not None:
-            env = import_module("bidex_meta.clients.skrl_env").SkrlEnv(world, seed)
-        return numbers(env.reset()[0])
-
-    def step(action: np.ndarray) -> Told:
-        obs, reward, terminated, truncated, infos = env.step(torch.from_numpy(action))
-        flags = numbers(terminated)[:, 0], numbers(truncated)[:, 0]
-        return Told(numbers(obs), *flags, numbers(obs), (obs, reward, *flags, infos))
-
-    return Client(reset, step, world.close)
-
-
-def of_torchrl(world: Any) -> Client:
-    env = import_module("bidex_meta.clients.torchrl_env").TorchRLEnv(world)
-    state: Any = None
-
-    def reset(seed: int | None) -> np.ndarray:
-        nonlocal state
-        if seed is not None:
-            env.set_seed(seed)
-        state = env.reset()
-        return numbers(state["observation"])
-
-    def step(action: np.ndarray) -> Told:
-        nonlocal state
-        told, state = env.step_and_maybe_reset(state.set("action", torch.from_numpy(action)))
-        after = told["next"]
-        flags = (numbers(after[name])[:, 0] for name in ("terminated", "truncated"))
-        return Told(numbers(state["observation"]), *flags, numbers(after["observation"]), told.to_dict())
-
-    return Client(reset, step, env.close)
-
-
-def of_metaworld(world: Any) -> Client:
-    envs = MetaWorldEnvs(world)
-
-    def step(action: np.ndarray) -> Told:
-        obs, reward, terminated, truncated, info = envs.step(action)
-        return Told(obs, terminated, truncated, info["final_obs"], (obs, reward, terminated, truncated, info))
-
-    return Client(lambda seed: envs.reset(seed=seed)[0], step, envs.close)
-
-
-def of_single(world: Any) -> Client:
-    """Gymnasium's single environment; it makes its world itself."""
-    env = TaskEnv(NAME)
-
-    def step(action: np.ndarray) -> Told:
-        obs, reward, terminated, truncated, info = env.step(action[0])
-        flags = np.array([terminated]), np.array([truncated])
-        return Told(obs[None], *flags, obs[None], (obs, reward, info))
-
-    return Client(lambda seed: env.reset(seed=seed)[0][None], step, env.close)
-
-
-def of_pettingzoo(world: Any) -> Client:
-    """PettingZoo's parallel environment; it makes its world itself."""
-    env = import_module("bidex_meta.clients.pettingzoo").parallel_env(NAME, "single")
-    (agent,) = env.possible_agents
-
-    def step(action: np.ndarray) -> Told:
-        obs, reward, terminated, truncated, info = env.step({agent: action[0]})
-        flags = np.array([terminated[agent]]), np.array([truncated[agent]])
-        return Told(obs[agent][None], *flags, obs[agent][None], (obs, reward, info))
-
-    return Client(lambda seed: env.reset(seed=seed)[0][agent][None], step, env.close)
-
-
-VECTORS = {"world": of_world, "numpy": of_numpy, "sb3": of_sb3, "rsl_rl": of_rsl_rl, "skrl": of_skrl}
-VECTORS |= {"torchrl": of_torchrl, "metaworld": of_metaworld}
-SINGLES = {"gymnasium": of_single, "pettingzoo": of_pettingzoo}
-CLIENTS = VECTORS | SINGLES
-MODES = {"skrl": "NEXT_STEP", "metaworld": "DISABLED"}
-PACKAGES = {"sb3": "stable_baselines3", "rsl_rl": "rsl_rl", "skrl": "skrl", "torchrl": "torchrl"}
-PACKAGES |= {"pettingzoo": "pettingzoo"}
-
-
-def points(mode: str = "SAME_STEP", **more: Any) -> PointWorld:
-    return PointWorld(ROWS, {"Near": ring(3), "Far": 2 * ring(3)}, LIMITS, mode=mode, **more)
-
-
-def client(name: str, **more: Any) -> Client:
-    if name in PACKAGES:
-        pytest.importorskip(PACKAGES[name])
-    return CLIENTS[name](points(MODES.get(name, "SAME_STEP"), **more))
-
-
-def actions(name: str, steps: int, seed: int = 0) -> np.ndarray:
-    shape = (steps, 1, 52) if name in SINGLES else (steps, ROWS, 2)
-    return np.random.default_rng(seed).uniform(-1, 1, shape).astype(np.float32)
 
 
 def arrays(value: Any) -> list[Any]:
