@@ -20,6 +20,7 @@ from bidex_meta.clients.gymnasium_ids import OF_SINGLES, both_seeds, make_suite_
 from bidex_meta.clients.needs import check_training
 from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.suite import SPLITS, Suite
+from bidex_meta.suite_files import load_suite
 from bidex_meta.tasks.task import Task
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.validation import whole_number
@@ -282,7 +283,7 @@ def make_trials(
 
     `episodes` is the number of episodes in a trial; other arguments are those of `make_suite_world`, without `stagger`.
     """
-    chosen = Benchmark(suite, both_seeds(seed, benchmark_seed)[0]).suite
+    chosen = load_suite(suite)
     _check_hides(chosen.observation == "masked", chosen.name)
     for name in options.keys() & OF_SINGLES:
         raise BidexError(f"{name}: expected options of a world for trials. Leave it out.")

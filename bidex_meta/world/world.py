@@ -90,7 +90,7 @@ class World(BatchedWorld):
         self.endless = config.task_sampling == "fresh"
         draws = self.autoreset_mode != AutoresetMode.DISABLED
         self.draws_tasks = draws and config.task_sampling != "fixed"
-        """Whether environments draw their tasks; otherwise each of them keeps its task."""
+        """True if environments draw their tasks; otherwise each of them keeps its task."""
         self._renews_tasks = draws and self.endless
         if self._renews_tasks:
             # Entry j of a pool belongs to environment j, and each episode start replaces it.

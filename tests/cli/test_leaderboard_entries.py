@@ -237,9 +237,9 @@ def test_200_random_edits_are_refused_or_equal_in_meaning(kind: str, tmp_path: P
         path.write_text(json.dumps(edited))
         try:
             assert read_entry(path) == whole, f"{place} {json.dumps(parent)[:300]}"
-        except BidexError as told:
+        except BidexError as error:
             refused += 1
-            assert "\n" not in str(told) and str(path) in str(told)
+            assert "\n" not in str(error) and str(path) in str(error)
     assert refused > 150
 
 

@@ -20,24 +20,24 @@ ROWS = 4
 LIMITS = (5, 7)
 
 
-class Told(NamedTuple):
-    """What a library's user sees of a step, each (n, ...)."""
+class Outcome(NamedTuple):
+    """The result of a step as a user of the library sees it; arrays are (n, ...)."""
 
     obs: np.ndarray
-    """What the policy acts on next."""
+    """Observations for the next action."""
     terminated: np.ndarray
     truncated: np.ndarray
     final: np.ndarray | None
-    """Where an episode ended, its last observation, from the place where the library looks for it."""
+    """Last observations of ended episodes, from the place where the library looks for them; None if it has none."""
     raw: Any
-    """All that the step returned."""
+    """The complete return value of the step."""
 
 
 class Client(NamedTuple):
     """One library's adapter around a world."""
 
     reset: Callable[[int | None], np.ndarray]
-    step: Callable[[np.ndarray], Told]
+    step: Callable[[np.ndarray], Outcome]
     close: Callable[[], object]
 
 
@@ -46,10 +46,10 @@ def numbers(value: Any) -> np.ndarray:
 
 
 def of_world(world: Any) -> Client:
-    def step(action: np.ndarray) -> Told:
+    def step(action: np.ndarray) -> Outcome:
         obs, reward, terminated, truncated, info = world.step(torch.from_numpy(action))
         flags = numbers(terminated), numbers(truncated)
-        return Told(numbers(obs), *flags, numbers(info["final_obs"]), (obs, reward, *flags, info))
+        return Outcome(numbers(obs), *flags, numbers(info["final_obs"]), (obs, reward, *flags, info))
 
     return Client(lambda seed: numbers(world.reset(seed=seed)[0]), step, world.close)
 
@@ -57,12 +57,12 @@ def of_world(world: Any) -> Client:
 def of_numpy(world: Any) -> Client:
     env = NumpyWorld(world)
 
-    def step(action: np.ndarray) -> Told:
+    def step(action: np.ndarray) -> Outcome:
         obs, reward, terminated, truncated, info = env.step(action)
         final = obs.copy()
         for row in np.flatnonzero(info.get("_final_obs", [])):
             final[row] = info["final_obs"][row]
-        return Told(obs, terminated, truncated, final, (obs, reward, terminated, truncated, info))
+        return Outcome(obs, terminated, truncated, final, (obs, reward, terminated, truncated, info))
 
     return Client(lambda seed: env.reset(seed=seed)[0], step, env.close)
 
@@ -75,11 +75,11 @@ def of_sb3(world: Any) -> Client:
             env.seed(seed)
         return env.reset()
 
-    def step(action: np.ndarray) -> Told:
+    def step(action: np.ndarray) -> Outcome:
         obs, reward, dones, infos = env.step(action)
         cut = np.array([info.get("TimeLimit.truncated", False) for info in infos])
         final = np.stack([info.get("terminal_observation", obs[row]) for row, info in enumerate(infos)])
-        return Told(obs, dones & ~cut, cut, final, (obs, reward, dones, infos))
+        return Outcome(obs, dones & ~cut, cut, final, (obs, reward, dones, infos))
 
     return Client(reset, step, env.close)
 
@@ -87,11 +87,11 @@ def of_sb3(world: Any) -> Client:
 def of_rsl_rl(world: Any) -> Client:
     env = import_module("bidex_meta.clients.rsl_rl_env").RslRlVecEnv(world)
 
-    def step(action: np.ndarray) -> Told:
+    def step(action: np.ndarray) -> Outcome:
         obs, reward, dones, extras = env.step(torch.from_numpy(action))
         cut = extras["time_outs"]
         raw = obs.to_dict(), reward, dones, extras
-        return Told(numbers(obs["policy"]), numbers(dones & ~cut), numbers(cut), None, raw)
+        return Outcome(numbers(obs["policy"]), numbers(dones & ~cut), numbers(cut), None, raw)
 
     return Client(lambda seed: numbers(env.reset(seed)[0]["policy"]), step, world.close)
 
@@ -105,10 +105,10 @@ def of_skrl(world: Any) -> Client:
             env = import_module("bidex_meta.clients.skrl_env").SkrlEnv(world, seed)
         return numbers(env.reset()[0])
 
-    def step(action: np.ndarray) -> Told:
+    def step(action: np.ndarray) -> Outcome:
         obs, reward, terminated, truncated, infos = env.step(torch.from_numpy(action))
         flags = numbers(terminated)[:, 0], numbers(truncated)[:, 0]
-        return Told(numbers(obs), *flags, numbers(obs), (obs, reward, *flags, infos))
+        return Outcome(numbers(obs), *flags, numbers(obs), (obs, reward, *flags, infos))
 
     return Client(reset, step, world.close)
 
@@ -124,12 +124,12 @@ def of_torchrl(world: Any) -> Client:
         state = env.reset()
         return numbers(state["observation"])
 
-    def step(action: np.ndarray) -> Told:
+    def step(action: np.ndarray) -> Outcome:
         nonlocal state
-        told, state = env.step_and_maybe_reset(state.set("action", torch.from_numpy(action)))
-        after = told["next"]
+        result, state = env.step_and_maybe_reset(state.set("action", torch.from_numpy(action)))
+        after = result["next"]
         flags = (numbers(after[name])[:, 0] for name in ("terminated", "truncated"))
-        return Told(numbers(state["observation"]), *flags, numbers(after["observation"]), told.to_dict())
+        return Outcome(numbers(state["observation"]), *flags, numbers(after["observation"]), result.to_dict())
 
     return Client(reset, step, env.close)
 
@@ -137,9 +137,9 @@ def of_torchrl(world: Any) -> Client:
 def of_metaworld(world: Any) -> Client:
     envs = MetaWorldEnvs(world)
 
-    def step(action: np.ndarray) -> Told:
+    def step(action: np.ndarray) -> Outcome:
         obs, reward, terminated, truncated, info = envs.step(action)
-        return Told(obs, terminated, truncated, info["final_obs"], (obs, reward, terminated, truncated, info))
+        return Outcome(obs, terminated, truncated, info["final_obs"], (obs, reward, terminated, truncated, info))
 
     return Client(lambda seed: envs.reset(seed=seed)[0], step, envs.close)
 
@@ -148,10 +148,10 @@ def of_single(world: Any) -> Client:
     """Gymnasium's single environment; it makes its world itself."""
     env = TaskEnv(NAME)
 
-    def step(action: np.ndarray) -> Told:
+    def step(action: np.ndarray) -> Outcome:
         obs, reward, terminated, truncated, info = env.step(action[0])
         flags = np.array([terminated]), np.array([truncated])
-        return Told(obs[None], *flags, obs[None], (obs, reward, info))
+        return Outcome(obs[None], *flags, obs[None], (obs, reward, info))
 
     return Client(lambda seed: env.reset(seed=seed)[0][None], step, env.close)
 
@@ -161,10 +161,10 @@ def of_pettingzoo(world: Any) -> Client:
     env = import_module("bidex_meta.clients.pettingzoo").parallel_env(NAME, "single")
     (agent,) = env.possible_agents
 
-    def step(action: np.ndarray) -> Told:
+    def step(action: np.ndarray) -> Outcome:
         obs, reward, terminated, truncated, info = env.step({agent: action[0]})
         flags = np.array([terminated[agent]]), np.array([truncated[agent]])
-        return Told(obs[agent][None], *flags, obs[agent][None], (obs, reward, info))
+        return Outcome(obs[agent][None], *flags, obs[agent][None], (obs, reward, info))
 
     return Client(lambda seed: env.reset(seed=seed)[0][agent][None], step, env.close)
 
