@@ -8,7 +8,7 @@ from bidex_meta.cli import looking, main
 from bidex_meta.tasks import registry
 from bidex_meta.worlds.own import OwnSuite, SingleClass
 from tests.cli.conftest import toy
-from tests.cli.test_run import run
+from tests.cli.small_runs import run
 
 
 @pytest.fixture

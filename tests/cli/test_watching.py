@@ -13,7 +13,7 @@ from bidex_meta.runs import RunFolder, read_metrics
 from bidex_meta.runs.writers import LOGGERS, Writer
 from bidex_meta.utils import gl_backend
 from tests.algos.ranks import same
-from tests.cli.test_run import final, run
+from tests.cli.small_runs import final, run
 
 
 @pytest.fixture(autouse=True)
