@@ -72,7 +72,7 @@ goldens: .venv/.installed-dev
 DEVICE ?= cuda:0
 OUT ?= gpu-results
 SUITE ?= MT20-v2
-SIZES ?= 8192 32768
+SIZES ?= 512 8192 32768
 ROWS ?= 8192
 TRAIN_SECONDS ?= 60
 QUARTER ?= 13
@@ -85,7 +85,7 @@ bench gpu-quarter: export PYTHONPATH := .:algos:$(PYTHONPATH)
 bench: $(INSTALLED)
 	$(BENCH) $(ARGS)
 
-gpu-quarter: $(INSTALLED)
+gpu-quarter: $(INSTALLED:%=%-dev)
 	$(BENCH) quarter --device $(DEVICE) --out $(OUT) --suite $(SUITE) --sizes $(SIZES) --num-envs $(ROWS) \
 		--seconds $(TRAIN_SECONDS) --minutes $(QUARTER) $(ARGS)
 

@@ -77,4 +77,4 @@ class BatchRenderer(Renderer):
         with self._on_device():
             mjw.render(self._m, self._d, self._context)
         packed = wp.to_torch(self._context.rgb_data.view(wp.int32)).view(torch.uint8)  # blue, green, red, alpha
-        return packed.view(self._num, self._edge, self._edge, 4)[..., [2, 1, 0]]
+        return packed.view(self._num, self._edge, self._edge, 4)[..., :3].flip(-1)

@@ -20,7 +20,7 @@ import warp as wp
 from torch import Tensor
 
 from bidex_meta.engine import kernels
-from bidex_meta.engine.capacity import Capacity
+from bidex_meta.engine.capacity import Capacity, check_ordered_sums
 from bidex_meta.engine.health import LARGEST, STATE, checked_state
 from bidex_meta.engine.kernels import Guard
 from bidex_meta.engine.lean import lean
@@ -93,6 +93,7 @@ class WarpEngine(Engine):
             self._put(capacity)
             self._bind()
             self._substeps = 1
+            self._check_sums()
             self._scratch = Scratch(self._device)
             with self._from_scratch():
                 self._advance()  # compiles all kernels and allocates memory, which a capture cannot do
@@ -144,7 +145,10 @@ class WarpEngine(Engine):
         else:
             kept = [value.clone() for value in self._stepped]
         self._substeps = substeps
-        self._play(f"step {substeps}", self._advance)
+        name = f"step {substeps}"
+        if name not in self._graphs:
+            self._check_sums()
+        self._play(name, self._advance)
         if active is not None:
             for value, old in zip(self._stepped, kept, strict=True):
                 value.copy_(torch.where(active.view(-1, *[1] * (value.dim() - 1)), value, old))
@@ -239,6 +243,11 @@ class WarpEngine(Engine):
         round_ones = (mujoco.mjtGeom.mjGEOM_ELLIPSOID, mujoco.mjtGeom.mjGEOM_CYLINDER)
         convex = np.isin(kinds, round_ones).any(axis=1) & (kinds != mujoco.mjtGeom.mjGEOM_PLANE).all(axis=1)
         return int(candidates[0]), int(convex.sum())
+
+    def _check_sums(self) -> None:
+        """Raise BidexError if the ordered sums of the next graph would not fit into the GPU's free memory."""
+        if self._deterministic and self._device.is_cuda:
+            check_ordered_sums(self._m.nv, self._d.njmax, self.num, self._substeps, self._device.free_memory)
 
     def _advance(self) -> None:
         """Run the substeps of a control step, then refresh position and velocity sensors."""

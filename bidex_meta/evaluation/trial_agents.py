@@ -1,6 +1,7 @@
 """Adapter that gives a user's own agent (``TrialAgent``) the methods that the meta-test calls."""
 
 import copy
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -8,15 +9,17 @@ from torch import Tensor
 from bidex_meta.agents import Agent, Timestep, TrialAgent
 from bidex_meta.errors import BidexError, one_line
 
+_Any = TypeVar("_Any", bound=TrialAgent | Agent)
+
 
 def adapting(agent: TrialAgent | Agent) -> Agent:
     """Return an agent that has the methods called by the meta-test.
 
-    A ``TrialAgent`` is copied and wrapped in an adapter. Any other agent is returned unchanged.
+    The agent is copied, so that splits do not influence each other, and a ``TrialAgent`` is wrapped in an adapter.
     """
     if isinstance(agent, TrialAgent) and not hasattr(agent, "adapt_action"):
         return AdaptingTrialAgent(_copied(agent))
-    return agent  # pyright: ignore[reportReturnType]
+    return _copied(agent)  # pyright: ignore[reportReturnType]
 
 
 class AdaptingTrialAgent:
@@ -65,7 +68,7 @@ class AdaptingTrialAgent:
         self._playing.observe(timestep)
 
 
-def _copied(agent: TrialAgent) -> TrialAgent:
+def _copied(agent: _Any) -> _Any:
     """Return a deep copy of an agent; raise BidexError if it holds something that cannot be copied."""
     try:
         return copy.deepcopy(agent)

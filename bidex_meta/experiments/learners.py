@@ -125,19 +125,26 @@ def choose_preset(kind: LearnerKind, asked: str, device: str, first: tuple[str, 
     """Choose a learner's preset; return its name and the reason for the choice as a text.
 
     ``asked`` is the requested preset. If it is ``auto``, the preset ``first`` is chosen if the learner has it,
-    otherwise one that fits the device. ``first`` is a preset and the reason, as in ``Worlds.preset``.
+    otherwise one that fits the device. ``first`` is a preset and the reason, as in ``Worlds.preset``. If a learner has
+    both ``v2`` and ``gpu``, then ``gpu`` is ``v2`` for a GPU.
     """
     if asked.casefold() != "auto":
         return known_name("preset", asked, ["auto", *kind.presets]), "as asked"
+    cpu = device.startswith("cpu")
     if first is not None and first[0] in kind.presets:
+        name, reason = first
+        if name == "v2" and "gpu" in kind.presets and not cpu:
+            return "gpu", f"{reason}, and the device is a GPU"
         return first
     on_gpu = next((name for name in ("paper", "gpu") if name in kind.presets), None)
     if on_gpu is None or "laptop" not in kind.presets:
         return next(iter(kind.presets)), "it is the learner's first"
-    if device.startswith("cpu"):
+    if cpu:
         return "laptop", "the device is a CPU"
     if "tuned" in kind.presets:
         return "laptop", "paper is known not to be best, and tuned goes on from what another run has learned"
+    if on_gpu == "gpu" and "v2" in kind.presets:
+        return "laptop", "gpu is for version 2"
     return on_gpu, "the device is a GPU"
 
 

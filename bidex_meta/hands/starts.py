@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bidex_meta.hands.hand import DISTAL_PER_MIDDLE, hand
 from bidex_meta.hands.poses import HandPose
-from bidex_meta.utils.maths import conjugate, constant, dot, norm, rotate, xyzw
+from bidex_meta.utils.maths import conjugate, constant, dot, indices, norm, rotate, xyzw
 
 _WRIST = (0.0, 0.01, 0.256)
 """Wrist origin in the mount frame, metres; the palm lies 0.034 m further along the z axis that the wrist has
@@ -112,7 +112,8 @@ def make_room_for(joints: Tensor, position: Tensor, points: Tensor, radii: Tenso
     (n, 24) and the object's shift in the mount frame (n, 3). ``make_room`` does the same for an egg.
     """
     joints = joints.clone()
-    joints[:, hand().index(*(f"THJ{k}" for k in range(5)))] = 0.0
+    thumb = indices(hand().index(*(f"THJ{k}" for k in range(5))), joints)
+    joints.index_fill_(1, thumb, 0.0)
     axes = _palm_axes(joints)
     centre = _in_palm(position, joints, axes)
     points = torch.stack([dot(points, a[:, None]) for a in axes], dim=2)
@@ -224,18 +225,27 @@ def _palm_axes(joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     )
 
 
+def _sums_along(bones: Tensor) -> Tensor:
+    """Return the cumulative sums over a finger's three bones, the third axis.
+
+    In deterministic mode torch refuses ``cumsum`` of floats on a GPU.
+    """
+    first, second, third = bones.unbind(dim=2)
+    return torch.stack((first, first + second, first + second + third), dim=2)
+
+
 def _finger_segments(joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the centre lines of the fingers' capsules, palm frame: starts, directions (n, 4, 3, 3), lengths (3,)."""
     where = _indices(joints.device)
     side = joints[:, where.side]
     bend = torch.stack([joints[:, g] for g in (where.base, where.middle, where.distal)], dim=2)
     bend[:, -1, 0] += _CUP_TILT * joints[:, where.cup]
-    bend = bend.cumsum(dim=2)
+    bend = _sums_along(bend)
     sin = bend.sin()
     cos = bend.cos()
     along = torch.stack((side.sin()[..., None] * cos, -sin, side.cos()[..., None] * cos), dim=3)
     length = constant(_LENGTHS, joints)
-    ends = (along * length[:, None]).cumsum(dim=2)
+    ends = _sums_along(along * length[:, None])
     roots = constant(tuple((x, 0.0, z) for x, z in _ROOTS), joints).repeat(len(joints), 1, 1)
     roots[:, -1, 1] = -_CUP_LIFT * joints[:, where.cup]
     start = roots[:, :, None] + torch.cat((torch.zeros_like(ends[:, :, :1]), ends[:, :, :-1]), dim=2)

@@ -191,7 +191,6 @@ class StackBlock(_TwoBlocks):
     formula = "1.5 - d_left - d_right + 2 (0.24 - d), d the sum of both blocks' distances to their targets"
     solved = "both blocks within 3 cm of their targets, block 1 on block 2"
     deviations = (
-        "The printed formula names target 1 twice; here each block has its own.",
         "Friction between blocks is 0.375 instead of 0.25; between hand and table it is 0.225 instead of 0.35.",
     )
     episode_steps = 250

@@ -24,19 +24,26 @@ stepped only a few times, or only a few times between changes of its tasks, neve
 
 
 class Record(Protocol):
-    """Records work as ``cuda_graph`` does."""
+    """Records work as the result of ``cuda_graphs`` does."""
 
     def __call__(self, work: Callable[[], Result], /) -> tuple[Callable[[], None], Result]:
         """Return a function that repeats the work in the same memory, and the tensors that will hold its results."""
         ...
 
 
-def cuda_graph(work: Callable[[], Result]) -> tuple[Callable[[], None], Result]:
-    """Record work as one CUDA graph."""
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-        result = work()
-    return graph.replay, result
+def cuda_graphs(device: torch.device) -> Record:
+    """Return a function that records work on a GPU as one CUDA graph."""
+    # Without this stream, torch would record on its current device, and the recording of work on another GPU would be
+    # empty.
+    stream = torch.cuda.Stream(device)
+
+    def record(work: Callable[[], Result]) -> tuple[Callable[[], None], Result]:
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.device(device), torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
+            result = work()
+        return graph.replay, result
+
+    return record
 
 
 class GraphCache:
@@ -51,7 +58,7 @@ class GraphCache:
     ) -> None:
         """Take the function ``get``, which returns the state's tensors by name, and ``put``, which replaces them.
 
-        ``record`` is e.g. ``cuda_graph``.
+        ``record`` is e.g. a result of ``cuda_graphs``.
         """
         self._get = get
         self._put = put
@@ -148,10 +155,7 @@ class CapturedStepper:
     """Runs each part of a step directly a few times, then records it as a graph and replays the graph."""
 
     def __init__(
-        self,
-        get: Callable[[], dict[str, Tensor]],
-        put: Callable[[dict[str, Tensor]], None],
-        record: Record = cuda_graph,
+        self, get: Callable[[], dict[str, Tensor]], put: Callable[[dict[str, Tensor]], None], record: Record
     ) -> None:
         """Take the same arguments as ``GraphCache``."""
         self._graphs = GraphCache(get, put, record)
@@ -175,6 +179,7 @@ class SideBySide:
 
     def __init__(self, jobs: int, device: torch.device) -> None:
         """Prepare streams; ``jobs`` is the maximum number of jobs that run at the same time."""
+        self._device = device
         several = device.type == "cuda" and jobs > 1
         if several:
             self._streams = [torch.cuda.Stream(device) for _ in range(jobs)]
@@ -192,7 +197,7 @@ class SideBySide:
             for job in jobs:
                 job()
             return
-        caller = torch.cuda.current_stream()
+        caller = torch.cuda.current_stream(self._device)
         # One event is recorded before all jobs. A later event in the legacy stream might have to wait for running jobs.
         before = caller.record_event()
         for stream, job in zip(self._streams, jobs, strict=True):

@@ -28,7 +28,7 @@ from bidex_meta.world import checked
 from bidex_meta.world.base import BatchedWorld, Outcome, Slots
 from bidex_meta.world.config import WorldConfig
 from bidex_meta.world.contract import Info, Options, State, Step
-from bidex_meta.world.graphs import CapturedStepper, SideBySide
+from bidex_meta.world.graphs import CapturedStepper, SideBySide, cuda_graphs
 from bidex_meta.world.groups import Group, Slot, build_groups, sights, with_pool, with_pools
 from bidex_meta.world.hidden_parts import HiddenParts
 from bidex_meta.world.observations import observation_groups
@@ -115,7 +115,7 @@ class World(BatchedWorld):
         self._past = torch.zeros(self.num_envs, remembered, self.action_size, device=self.device)
         self._side_by_side = SideBySide(len(groups), self.device)
         if self.device.type == "cuda":
-            self._stepper = CapturedStepper(self._state, self._put_state)
+            self._stepper = CapturedStepper(self._state, self._put_state, cuda_graphs(self.device))
         self._painter = Painter()
         self.pictures: Tensor | None = None
         """The last ``info["pixels"]``; None without ``pixels`` and before the first reset."""

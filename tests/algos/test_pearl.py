@@ -77,6 +77,21 @@ def test_the_posterior_is_made_of_the_episodes_of_a_trial() -> None:
     assert not sums(rows, torch.ones_like(rows), torch.zeros_like(rows)).any()
 
 
+@pytest.mark.parametrize("held", [8, 4])
+def test_transitions_that_the_replay_no_longer_holds_tell_nothing(held: int) -> None:
+    learner = learner_on(config=replace(TINY, replay_steps=held, context=2000))
+    learner.iterate()
+    learner.policy.evidence = lambda obs, actions, reward, following: reward[:, None]  # type: ignore[method-assign]
+    assert learner.replay.filled == held and learner.bounds[0, 0].tolist()[:3] == [9, 12, 15]
+    rows = torch.arange(4)
+    found = learner._shown(rows, torch.zeros_like(rows), torch.full_like(rows, 2))[:, 0]
+    # Of the trial's steps 9 to 14, a replay of eight steps holds the last three, one of four steps none.
+    rewards = learner.replay._steps["rewards"]
+    kept = [rewards[step % len(rewards), :4] for step in range(9, 15) if step >= 20 - held]
+    expected = 6 * torch.stack(kept).mean(0) if kept else torch.zeros(4)
+    assert_close(found, expected, rtol=0.05, atol=0.0)
+
+
 def test_the_agent_adds_up_what_an_update_estimates() -> None:
     learner = learner_on(rows=5)
     learner.iterate()

@@ -114,6 +114,24 @@ def test_an_agent_with_the_calls_of_a_learner_shares_what_it_finds() -> None:
     assert list(alone.splits) == ["train"] and list(alone.splits["train"].after.classes) == list(COUNTS["train"])
 
 
+class Drawing(Finder):
+    """Draws its exploring actions from one generator, which ``init`` does not restart."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.generator = torch.Generator().manual_seed(0)
+
+    def adapt_action(self, obs: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        return torch.rand(len(obs), 2, generator=self.generator), {}
+
+
+def test_what_an_agent_does_on_one_split_does_not_change_the_other() -> None:
+    size = {"device": "cpu", "tasks": 1, "rollouts": 2}
+    agent = Drawing()
+    both = meta_test(agent, "ML4", **size).splits
+    assert both["test"].after == meta_test(agent, "ML4", split="test", **size).splits["test"].after
+
+
 def test_the_file_is_read_again_and_is_no_run_s(tmp_path: Path, adapted: Path, refused) -> None:
     path = tmp_path / "result.json"
     found = meta_test(Scout(), "ML4", task_seed=3, **SMALL)

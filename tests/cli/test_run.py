@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 
 from bidex_meta.cli import COMMANDS, main
+from bidex_meta.experiments.learners import choose_preset, learner_kind
 from bidex_meta.runs import RunFolder, read_metrics
 from bidex_meta.worlds import open_worlds
+from bidex_meta.worlds.base import V2_PRESET
 from tests.cli.small_runs import SMALL, final, run
 from tests.pages import ROOT
 
@@ -202,6 +204,21 @@ def test_the_discount_fits_the_suite(shown, words, preset, gamma):
 
 
 # Run, resume, evaluate, plot, render.
+
+
+@pytest.mark.parametrize(
+    ("algo", "version", "cpu", "gpu"),
+    [
+        ("mtppo", 1, "laptop", "paper"), ("mtppo", 2, "v2", "v2"), ("mtsac", 2, "laptop", "paper"),
+        ("maml", 1, "laptop", "laptop"), ("maml", 2, "v2", "v2"), ("rl2", 1, "laptop", "paper"),
+        ("rl2", 2, "v2", "gpu"), ("varibad", 1, "laptop", "laptop"), ("varibad", 2, "v2", "gpu"),
+        ("pearl", 1, "laptop", "laptop"), ("pearl", 2, "v2", "gpu"), ("flashsac", 1, "laptop", "gpu"),
+    ],
+)  # fmt: skip
+def test_the_automatic_preset_fits_version_and_device(algo, version, cpu, gpu):
+    first = V2_PRESET if version == 2 else None
+    found = [choose_preset(learner_kind(algo), "auto", device, first)[0] for device in ("cpu", "cuda")]
+    assert found == [cpu, gpu]
 
 
 def test_run_trains_evaluates_and_can_be_looked_at_again(toy_worlds, tmp_path, capsys, shown, refused):

@@ -3,8 +3,9 @@
 import mujoco
 import pytest
 
-from bidex_meta.engine.capacity import room_for
+from bidex_meta.engine.capacity import check_ordered_sums, room_for
 from bidex_meta.engine.models import differing_fields, same_structure
+from bidex_meta.errors import BidexError
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.scene import Scene, build_spec, compile_scene
@@ -61,6 +62,16 @@ def test_room_exceeds_what_was_seen(name: str) -> None:
     room = room_for([seen])
     assert room.contacts >= 1.5 * seen.contacts and room.rows >= 1.5 * seen.rows
     assert room.contacts >= room.convex >= max(2, 1.5 * seen.convex)
+
+
+@pytest.mark.parametrize(("num", "fits"), [(25, True), (8192, False)])
+def test_ordered_sums_that_exceed_the_memory_are_refused(num: int, fits: bool) -> None:
+    """The door classes on a GPU of 139 GB: 66 degrees of freedom, four substeps."""
+    if fits:
+        check_ordered_sums(66, 192, num, 4, 139 * 10**9)
+    else:
+        with pytest.raises(BidexError, match=r"8,192 environments .* about 473 GB .* \(about 2,40. of this kind fit\)"):
+            check_ordered_sums(66, 192, num, 4, 139 * 10**9)
 
 
 def test_every_class_was_measured_and_a_stranger_has_the_largest_of_all() -> None:

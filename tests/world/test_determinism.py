@@ -140,8 +140,8 @@ def test_a_deterministic_run_on_a_gpu_repeats(tmp_path: Path) -> None:
     digests = []
     for number in range(2):
         out = str(tmp_path / str(number))
-        argv = ["run", "--suite", "MT20", "--algo", "mtppo", "--device", "cuda:0", "--num-envs", "400"]
-        argv += ["--steps", "800000", "--deterministic", "--logger", "none", "--no-evaluate", "--run-dir", out]
+        argv = ["run", "--suite", "MT20", "--algo", "mtppo", "--device", "cuda:0", "--num-envs", "100"]
+        argv += ["--steps", "200000", "--deterministic", "--logger", "none", "--no-evaluate", "--run-dir", out]
         assert main(argv) == 0
         state, _ = checkpoint(RunFolder.open(out))
         digests.append(content_of(state["learner"]))

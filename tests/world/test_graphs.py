@@ -1,7 +1,8 @@
 """Recorded stretches of a step: a tape of operations in fixed memory, as a CUDA graph is one, against plain runs."""
 
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from torch.utils._pytree import tree_leaves
 from bidex_meta import Benchmark
 from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.world import World, world
-from bidex_meta.world.graphs import CapturedStepper, EagerStepper, SideBySide, fresh
+from bidex_meta.world.graphs import CapturedStepper, EagerStepper, SideBySide, cuda_graphs, fresh
 from tests.world.play import assert_same, number_of_ends, play, random_actions, suite_world
 from tests.world.test_masked import MaskedEngine, at_work
 
@@ -191,11 +192,11 @@ def test_nothing_of_the_caller_stands_between_jobs_side_by_side(monkeypatch: pyt
     """An event in CUDA's legacy stream could wait for the jobs before it: there is one, before all jobs."""
     log: list[tuple[str, str, object]] = []
     names = iter("ab")
-    caller = FakeStream(log, "caller")
+    callers = {torch.device("cuda:1"): FakeStream(log, "caller")}
     monkeypatch.setattr(torch.cuda, "Stream", lambda device: FakeStream(log, next(names)))
-    monkeypatch.setattr(torch.cuda, "current_stream", lambda: caller)
+    monkeypatch.setattr(torch.cuda, "current_stream", callers.__getitem__)
     monkeypatch.setattr(torch.cuda, "stream", lambda stream: nullcontext())
-    SideBySide(2, torch.device("cuda")).run([lambda i=i: log.append(("job", "runs", i)) for i in range(2)])
+    SideBySide(2, torch.device("cuda:1")).run([lambda i=i: log.append(("job", "runs", i)) for i in range(2)])
     assert log == [
         ("caller", "records", None),
         ("a", "waits", "event of caller"), ("job", "runs", 0),
@@ -203,6 +204,25 @@ def test_nothing_of_the_caller_stands_between_jobs_side_by_side(monkeypatch: pyt
         ("a", "records", None), ("caller", "waits", "event of a"),
         ("b", "records", None), ("caller", "waits", "event of b"),
     ]  # fmt: skip
+
+
+def test_a_recording_is_made_on_the_device_of_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On torch's current device it would be empty, and the world would stand still."""
+    current: list[object] = ["cuda:0"]
+
+    @contextmanager
+    def on(device: object) -> Iterator[None]:
+        current.append(device)
+        yield
+        current.pop()
+
+    monkeypatch.setattr(torch.cuda, "Stream", lambda device: f"stream of {device}")
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", lambda: SimpleNamespace(replay=None))
+    monkeypatch.setattr(torch.cuda, "device", on)
+    monkeypatch.setattr(torch.cuda, "graph", lambda graph, stream, **_: on(stream))
+    device = torch.device("cuda:1")
+    _, where = cuda_graphs(device)(lambda: list(current))
+    assert where == ["cuda:0", device, "stream of cuda:1"]
 
 
 @pytest.mark.gpu

@@ -47,7 +47,7 @@ def quarter(
     out: Path = Path("gpu-results"),
     device: str = "cuda:0",
     suite: str = "MT20-v2",
-    sizes: Sequence[int] = (8192, 32768),
+    sizes: Sequence[int] = (512, 8192, 32768),
     num_envs: int = 8192,
     seconds: float = 60.0,
     rest: float | None = None,
@@ -107,10 +107,10 @@ def _steps(
     world = ["--device", device, "--suite", suite]
     tests = ["-m", "pytest", "-q", "-p", "no:cacheprovider"]
     yield _Step("kernels", [*bench, "kernels", *world], 180.0)
-    yield _Step("tests", [*tests, "-m", "gpu and not slow"], 120.0)
+    yield _Step("tests", [*tests, "-m", "gpu and not slow and not parity"], 120.0)
     measured = ["--sizes", *map(str, sizes), "--out", str(out / "switches.json")]
     yield _Step("switches", [*bench, "switches", *world, *measured], 240.0)
-    drawn = ["--device", device, "--suites", suite, suite.replace("MT", "ML", 1), "--num-envs", str(sizes[0] // 4)]
+    drawn = ["--device", device, "--suites", suite, suite.replace("MT", "ML", 1), "--num-envs", str(max(1, sizes[-1] // 16))]
     yield _Step("pictures", [*bench, "pictures", *drawn, "--out", str(out / "pictures.json")], 90.0)
     for name, (on, algo, preset, share) in TRAININGS.items():
         flags = ["--algo", algo, "--preset", preset, "--device", device, "--num-envs", str(round(share * num_envs))]
@@ -119,6 +119,7 @@ def _steps(
         rest = max(end - time.monotonic() - _STARTING, seconds)
     flags = ["--algo", "mtppo", "--preset", "v2", "--device", device, "--num-envs", str(num_envs)]
     yield _training(out / "rest", suite, flags, rest)
+    yield _Step("parity", [*tests, "-m", "gpu and parity and not slow"], 300.0)
     yield _Step("repeatable", [*tests, "-m", "gpu and slow"], 600.0)
 
 

@@ -31,7 +31,7 @@ _REPLAYED = 50
 
 def switches(
     suite: str = "MT20-v2",
-    sizes: Sequence[int] = (8192, 32768),
+    sizes: Sequence[int] = (512, 8192, 32768),
     steps: int = 20,
     repeats: int = 5,
     device: str = "cuda:0",
@@ -43,7 +43,7 @@ def switches(
 
     Args:
         suite: Suite to step.
-        sizes: Numbers of environments.
+        sizes: Numbers of environments. The deterministic world needs so much memory that only the smallest one fits.
         steps: Number of control steps of each repeat.
         repeats: Number of repeats for each world; medians are reported.
         device: Device of the worlds.
@@ -73,6 +73,7 @@ def switches(
                 random_steps(world, RECORDED)
             except (BidexError, RuntimeError, TypeError) as error:
                 row[name] = {"error": one_line(error)}
+                world = None  # frees its memory
             else:
                 worlds[name] = world
         row |= _in_turns(worlds, steps, repeats)

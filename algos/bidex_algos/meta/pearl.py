@@ -183,14 +183,15 @@ class PEARL(MTSAC):
 
         The evidence of a transition consists of the terms that the transition adds to the parameters of the posterior.
         ``rows`` (M,) are environments. ``trial`` (M,) is 0 for an environment's previous trial and 1 for its running
-        trial. The estimate uses ``context`` random transitions of these episodes.
+        trial. The estimate uses ``context`` random transitions of these episodes. Transitions that the replay no longer
+        holds have no weight.
         """
         begin = self.bounds[trial, rows, 0]
         end = self.bounds[trial, rows, episodes]
         ages = (self.replay.added - end)[:, None] + self._below((end - begin)[:, None], len(rows), self.config.context)
         places = self.replay.places(rows[:, None], ages.clamp_max(self.replay.filled - 1))
         t = self.replay.take(places.flatten())
-        weights = self.replay.weights(places)[..., None]
+        weights = (self.replay.weights(places) * (ages < self.replay.filled))[..., None]
         evidence = self.policy.evidence(t.obs, t.actions, t.rewards, t.next_obs).unflatten(0, places.shape)
         return (weights * evidence).sum(1) / weights.sum(1).clamp_min(1.0) * (end - begin)[:, None]
 

@@ -25,6 +25,20 @@ _WHICH = 64  # width of the hidden layer of the network that classifies observat
 _TAIL = 4.0  # degrees of freedom of the Student distribution assumed for the model's errors
 
 
+def cumulated(shares: Tensor) -> Tensor:
+    """Return cumulative sums along the last axis.
+
+    In deterministic mode torch refuses ``cumsum`` of floats on a GPU, where the sums are therefore a product.
+    """
+    if shares.device.type == "cpu":
+        return shares.cumsum(-1)
+    return (shares.double() @ _ones_above(shares.shape[-1], shares.device)).to(shares.dtype)
+
+
+def _ones_above(size: int, device: torch.device) -> Tensor:
+    return torch.ones(size, size, dtype=torch.float64, device=device).triu()
+
+
 def spread(count: int, size: int) -> Tensor:
     """Return points (count, size) spread evenly over [-1, 1]: an additive recurrence (R_d of Roberts 2018)."""
     root = 1.5
@@ -236,7 +250,7 @@ class BeliefPolicy(RecurrentPolicy):
         state = memory.state + self.belief.evidence(obs, memory.reward, known)
         goal = self.belief.believed(state)
         if drawn is not None:
-            place = (state.softmax(-1).cumsum(-1) < drawn).sum(-1).clamp_max(self.memory - 1)
+            place = (cumulated(state.softmax(-1)) < drawn).sum(-1).clamp_max(self.memory - 1)
             goal = torch.where(drawn < 0.0, goal, self.belief.candidates[place])
         task = self.class_of(obs)
         found = self.actor.act(self.seen(obs, task), self.goals(goal), task)

@@ -142,7 +142,7 @@ class MTSAC(OffPolicy):
 
 
 class SAC(MTSAC):
-    """Multi-task SAC (Haarnoja et al. 2018, arXiv 1812.05905) on a batched world.
+    """Single-task SAC (Haarnoja et al. 2018, arXiv 1812.05905) on a batched world.
 
     The class is MT-SAC with additional presets for Humanoid-v5 (Table 49 of the Bi-DexHands appendix). The preset
     ``paper`` is from the appendix's Table 43 for SAC, which has the same numbers in all columns.

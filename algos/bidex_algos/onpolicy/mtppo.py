@@ -23,7 +23,7 @@ from bidex_meta.training.distributed import sum_gradients, world_size
 from bidex_meta.training.learner import NO_SOURCES, Capability, Parts, Sources, State
 from bidex_meta.utils.validation import Count, Positive, Whole, check_rising
 from bidex_meta.world.contract import VectorWorld
-from bidex_meta.world.graphs import GraphCache, cuda_graph
+from bidex_meta.world.graphs import GraphCache, cuda_graphs
 
 _VALUE_LOSS_WEIGHT = 2.0  # Adam cancels this factor, so it matters only for the clipping of the critic's gradients
 _MAX_GRAD_NORM = 1.0  # gradients are clipped to this norm, separately for actor and critic
@@ -105,7 +105,7 @@ class MTPPO(OnPolicy):
         # The weight of demonstrations is not a tensor, so an update with demonstrations cannot be recorded.
         alone = self.balance is None and sources.demonstrations is None and world_size() == 1
         if alone and self.device.type == "cuda":
-            self._graphs = GraphCache(dict, lambda _: None, cuda_graph)
+            self._graphs = GraphCache(dict, lambda _: None, cuda_graphs(self.device))
         if sources.demonstrations is not None:
             self.demonstrations = Demonstrations(sources.demonstrations, config.demonstration_batch, seed, self.device)
             self.per_process = (*self.per_process, "demonstrated")

@@ -159,7 +159,7 @@ class MTTRPO(OnPolicy):
 
 
 class TRPO(MTTRPO):
-    """Multi-task TRPO (Schulman et al. 2015, arXiv 1502.05477) on a batched world.
+    """Single-task TRPO (Schulman et al. 2015, arXiv 1502.05477) on a batched world.
 
     The class is MT-TRPO with another preset ``paper``, which is for a single task. Its networks are from Table 42 of
     the Bi-DexHands appendix. All other values are those of MT-TRPO, because the appendix has no table for TRPO.

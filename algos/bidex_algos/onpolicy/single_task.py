@@ -25,7 +25,7 @@ TASK_PRESETS: dict[str, dict[str, MTPPOConfig]] = {
 
 
 class PPO(MTPPO):
-    """Multi-task PPO (Schulman et al. 2017, arXiv 1707.06347) on a batched world.
+    """Single-task PPO (Schulman et al. 2017, arXiv 1707.06347) on a batched world.
 
     The class is MT-PPO with the presets of the Bi-DexHands appendix for a single task (B.1).
     """

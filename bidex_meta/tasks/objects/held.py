@@ -140,15 +140,21 @@ class HeldObject:
         inverse = conjugate(quaternion)
         position = rotate(inverse, place[:, :3] - constant(pose.position, place))
         orientation = multiply(inverse.expand(len(place), 4), xyzw(place[:, 3:]))
-        points = rotate(orientation[:, None], torch.as_tensor(self.centres).to(place)[None])
-        opened, shift = make_room_for(joints, position, points, torch.as_tensor(self.radii).to(place))
+        centres, radii = self._balls(place)
+        points = rotate(orientation[:, None], centres[None])
+        opened, shift = make_room_for(joints, position, points, radii)
         joints.copy_(opened.float())
         place[:, :3] += rotate(quaternion, shift).float()
 
     def depth_below(self, place: Tensor) -> Tensor:
         """Return the object's extent below its origin, metres, for poses (n, 7). Shape (n,)."""
-        points = rotate(xyzw(place[:, 3:])[:, None], torch.as_tensor(self.centres).to(place)[None])
-        return (torch.as_tensor(self.radii).to(place) - points[..., 2]).amax(dim=1)
+        centres, radii = self._balls(place)
+        points = rotate(xyzw(place[:, 3:])[:, None], centres[None])
+        return (radii - points[..., 2]).amax(dim=1)
+
+    def _balls(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Return ``centres`` and ``radii`` as tensors, which are copied to the device of ``like`` only once."""
+        return constant(tuple(map(tuple, self.centres.tolist())), like), constant(tuple(self.radii.tolist()), like)
 
 
 def shelf() -> list[str]:
