@@ -27,6 +27,7 @@ from bidex_meta.utils.validation import (
     Seed,
     Text,
     Threads,
+    builtin,
     check_fields,
     parse,
 )
@@ -60,18 +61,17 @@ def _whole_number(words: list[str]) -> int:
     return int(value)
 
 
-Steps = Annotated[
-    int,
-    Meta(ge=0, le=10**15),
-    PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="INT",
-        instance_from_str=_whole_number,
-        is_instance=lambda value: isinstance(value, int),
-        str_from_instance=lambda value: [str(value)],
-    ),
-]
+_FLAG_OF_STEPS = PrimitiveConstructorSpec(
+    nargs=1,
+    metavar="INT",
+    instance_from_str=_whole_number,
+    is_instance=lambda value: isinstance(value, int),
+    str_from_instance=lambda value: [str(value)],
+)
+Steps = Annotated[int, Meta(ge=0, le=10**15), _FLAG_OF_STEPS]
 """A whole number that may be written 2e7 on the command line."""
+TrainSteps = Annotated[int, Meta(ge=1, le=10**15), _FLAG_OF_STEPS]
+"""Training makes at least one iteration."""
 
 Several = Annotated[tuple[Text, ...], tyro.conf.UseAppendAction]
 """A flag that may be given several times."""
@@ -114,12 +114,12 @@ class RunConfig(Generic[LearnerSettings]):
     """Learner (see `bidex-meta list algos`), or your own class as package.module:Class (docs/own-learner.md)."""
     preset: Text = "auto"
     """Named defaults for the learner's options. auto: metaworld for Meta-World's suites; v2 for version 2, if the
-    learner has it; otherwise laptop on a CPU and paper on a GPU (maml and promp: laptop on both)."""
+    learner has it; otherwise laptop on a CPU and paper on a GPU (exceptions: docs/training.md)."""
     learner: LearnerSettings = field(default_factory=dict)  # pyright: ignore[reportAssignmentType]
     """Options of the learner (in Python also a dict of the values that differ from its preset)."""
     num_envs: Environments = UNRESOLVED
     """Number of environments that each process steps together, over all tasks."""
-    steps: Steps = field(default=UNRESOLVED, metadata=MAY_CHANGE)
+    steps: TrainSteps = field(default=UNRESOLVED, metadata=MAY_CHANGE)
     """Environment steps to train for, over all environments of all processes; may be written 2e7. With --dataset:
     gradient updates."""
     minutes: Positive | None = field(default=None, metadata=MAY_CHANGE)
@@ -182,6 +182,7 @@ class RunConfig(Generic[LearnerSettings]):
     processes. A resumed run keeps its number of threads."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "learner", builtin(self.learner))
         check_fields(self, "run", as_flags=True, unresolved=_UNRESOLVED)
 
     @property

@@ -57,10 +57,11 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         """Advance the environment by 1/60 s with an action (a,) in [-1, 1].
 
-        Returns observation (d,) float32, reward, terminated, truncated and info. `info` always has ``unstable``,
+        Returns observation (d,) float32, reward, terminated, truncated and info. `info` has ``unstable``,
         ``reward_terms`` and ``success``: whether the present state meets the goal, or, in version 2, whether the goal
-        has been held for 0.25 s. At an episode's end `info` also has ``is_success``, the success of the episode. In
-        version 1 an episode succeeds if the goal is met at any step, in version 2 if the goal is held at the end.
+        has been held for 0.25 s. ``is_success`` is the success of the episode if it ends at this step: in version 1
+        whether the goal was met at any step, in version 2 whether it is held now. It is given in every step, because a
+        wrapper may end an episode earlier than this environment.
         BidexError is raised if no episode is running, because otherwise the end of the last episode would count twice.
         """
         if self._over:
@@ -68,9 +69,8 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         obs, reward, terminated, truncated, batch = self.world.step(one_row(action, self.action_space))
         info: Info = {"success": bool(batch["success"][0]), "unstable": bool(batch["unstable"][0])}
         info["reward_terms"] = {name: float(term[0]) for name, term in batch["reward_terms"].items()}
+        info["is_success"] = bool(batch["running"]["success"][0])
         self._over = bool(terminated[0] or truncated[0])
-        if self._over:
-            info["is_success"] = bool(batch["running"]["success"][0])
         return obs[0].cpu().numpy(), float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]

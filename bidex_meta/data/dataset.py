@@ -263,7 +263,8 @@ class Dataset:
 
         ``observations`` (N, d), ``actions`` (N, a), ``rewards`` (N,) and ``next_observations`` (N, d) are float32;
         ``task`` (N,) is int64. ``terminated`` (N,), bool, marks transitions whose next observation must not be
-        bootstrapped from. BidexError is raised if the tensors do not fit into the free memory.
+        bootstrapped from. BidexError is raised if the tensors do not fit into the free memory, or if some of their
+        numbers are not finite.
         """
         import torch
 
@@ -281,7 +282,8 @@ class Dataset:
         }
         views = {name: tensor.numpy() for name, tensor in tensors.items()}
         start = 0
-        for episode in self.episodes():
+        for number, episode in enumerate(self.episodes()):
+            self.check_finite(number, episode.observations, episode.actions, episode.rewards)
             where = slice(start, start + len(episode))
             now = episode.observations[:-1]
             after = episode.observations[1:]
@@ -291,6 +293,15 @@ class Dataset:
                 views[name][where] = getattr(episode, name)
             start = where.stop
         return tensors
+
+    def check_finite(self, number: int, observations: np.ndarray, actions: np.ndarray, rewards: np.ndarray) -> None:
+        """Raise BidexError if episode ``number`` has observations, actions or rewards that are not finite."""
+        for name, values in {"observations": observations, "actions": actions, "rewards": rewards}.items():
+            if not np.isfinite(values).all():
+                raise BidexError(
+                    f"{self.name}: expected {name} that are finite as float32, got others in episode {number}. "
+                    "Leave it out, or record it again."
+                )
 
     def _outside_table(self) -> dict[str, np.ndarray]:
         steps = []

@@ -242,13 +242,7 @@ class _Form:
         """
         for number, episode in enumerate(self.dataset.episodes()):
             fitted, slot, seen = self._fitted(episode, ids)
-            arrays = {"observations": seen, "actions": episode.actions, "rewards": fitted.rewards}
-            for name, values in arrays.items():
-                if not np.isfinite(values).all():
-                    raise BidexError(
-                        f"{self.dataset.name}: expected {name} that are finite as float32, got others in episode "
-                        f"{number}. Leave it out, or record it again."
-                    )
+            self.dataset.check_finite(number, seen, episode.actions, fitted.rewards)
             yield fitted, slot, seen
 
     def _fitted(self, episode: Episode, ids: int) -> tuple[Episode, int, np.ndarray]:

@@ -16,7 +16,7 @@ from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.provenance import check_alike
 from bidex_meta.training.launch import say
 from bidex_meta.training.learner import Capability
-from bidex_meta.world.threads import set_up_torch
+from bidex_meta.world.threads import set_up_torch, torch_settings_kept
 from bidex_meta.worlds import open_worlds
 from bidex_meta.worlds.own import OwnSuite
 
@@ -45,6 +45,7 @@ def _plain(arm: Json) -> Json:
     return arm | {"own_minus": {name: None if gain is None else asdict(gain) for name, gain in gains.items()}}
 
 
+@torch_settings_kept()
 def control_runs(
     folders: Sequence[RunFolder], *, shots: int, rollouts: int | None, episodes: int, trials: int, num_envs: int,
     seed: int, device: str, engine: str

@@ -35,7 +35,7 @@ from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import portable
 from bidex_meta.utils.validation import Count, Environments, Few, Seed, Shots, check_fields
 from bidex_meta.utils.waiting import note
-from bidex_meta.world.threads import set_up_torch
+from bidex_meta.world.threads import set_up_torch, torch_settings_kept
 from bidex_meta.worlds import Worlds, open_worlds
 
 
@@ -196,6 +196,7 @@ USUAL_EVALUATION = FinalEvaluation()
 
 
 @checked_arguments
+@torch_settings_kept()
 def evaluate(
     run: RunFolder | str | Path,
     *,
@@ -257,6 +258,7 @@ def evaluate(
 
 
 @checked_arguments
+@torch_settings_kept()
 def meta_test(
     agent: RunFolder | str | Path | TrialAgent | Agent,
     suite: str | Path | None = None,

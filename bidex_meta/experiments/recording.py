@@ -41,7 +41,7 @@ from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted, ShiftedSt
 from bidex_meta.witness.scripts import script_of
 from bidex_meta.witness.store import load_witness
 from bidex_meta.world.contract import PooledWorld
-from bidex_meta.world.threads import set_up_torch
+from bidex_meta.world.threads import set_up_torch, torch_settings_kept
 from bidex_meta.worlds import Worlds, open_worlds
 
 RUNS = {"random": 0, "medium": 1, "expert": 1, "medium-expert": 2, "replay": 1, "demonstrations": 0}
@@ -123,6 +123,7 @@ class _Collection:
 
 
 @checked_arguments
+@torch_settings_kept()
 def record(config: RecordConfig) -> Dataset:
     """Record a data set, or resume its recording, and return it.
 

@@ -91,6 +91,11 @@ def check(config: AnyConfig, with_memory: bool = True) -> None:
         )
     if config.record:
         part_files.hdf5()  # raises BidexError if h5py is not installed
+    if config.stops_by_training and Capability.OFFLINE in kind.make.capabilities:
+        raise BidexError(
+            f"{config.algo} learns from data and plays no episodes: --stop-at-return and --stop-at-success need "
+            "evaluations. Add for example --evaluate-every 50."
+        )
     run_data.check_offline(kind, config.record, run_data.open_datasets(config.dataset), worlds)
     run_data.check_demonstrations(kind, config.demonstrations, worlds)
     run_teachers.check_teachers(kind, config, worlds)

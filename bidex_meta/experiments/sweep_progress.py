@@ -96,6 +96,12 @@ def state_of(run: PlannedRun) -> State:
                 f"{run.path} has trained for {last['step']:,} steps, expected at most {run.config.steps:,}. Give the "
                 "arm another name, or move the folder away."
             )
+        asked = run.config.evaluate_every
+        if evaluated and asked not in (None, stored.evaluate_every):
+            raise BidexError(
+                f"{run.path} has ended with evaluate_every {stored.evaluate_every}, expected {asked}. Evaluations "
+                "during training cannot be made later: leave evaluate_every, or give the arm another name."
+            )
     why = last_line(beside(run, "failed"))
     steps = run.config.goal(last)
     limit = run.config.minutes

@@ -14,6 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
+
 from bidex_meta.data.joined import join
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments import metatest, run_data, run_recording, run_teachers, watching
@@ -30,7 +32,7 @@ from bidex_meta.training.learner import NO_SOURCES, Capability, Sources
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.contract import VectorWorld
-from bidex_meta.world.threads import set_up_torch
+from bidex_meta.world.threads import set_up_torch, torch_settings_kept
 from bidex_meta.worlds import Worlds, open_worlds
 
 _LOG = logging.getLogger("bidex_meta")
@@ -61,6 +63,7 @@ class Stopped(KeyboardInterrupt):
 
 
 @checked_arguments
+@torch_settings_kept()
 def train(
     config: AnyConfig | None = None,
     *,
@@ -89,6 +92,9 @@ def train(
     folder = None
     try:
         with contextlib.ExitStack() as held:  # holds the lock of the run's folder
+            # The caller may have switched gradients off.
+            held.enter_context(torch.inference_mode(False))
+            held.enter_context(torch.enable_grad())
             old = together(lambda: None if resume is None else _opened(resume, run_dir))
             resolved = together(lambda: _checked(config, old))
             new = None if run_dir is None else Path(run_dir)

@@ -32,7 +32,7 @@ from bidex_meta.training.launch import say
 from bidex_meta.training.learner import Capability
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import exists
-from bidex_meta.world.threads import set_up_torch
+from bidex_meta.world.threads import set_up_torch, torch_settings_kept
 from bidex_meta.worlds import Worlds, open_worlds
 
 
@@ -71,6 +71,7 @@ class Verification:
 
 
 @checked_arguments
+@torch_settings_kept()
 def verify(
     run: RunFolder | str | Path,
     *,

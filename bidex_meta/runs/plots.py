@@ -268,7 +268,7 @@ def _add_legend(figure: "Figure", labels: Sequence[str]) -> None:
     lines = [_matplotlib().lines.Line2D([], [], color=_colour(number)) for number in range(len(labels))]
     inches = figure.get_size_inches()[0]
     words = ["\n".join(textwrap.wrap(_plain(label), max(20, int(12 * inches)))) for label in labels]
-    columns = max(1, min(len(labels), int(12 * inches) // (max(map(len, labels)) + 6)))
+    columns = max(1, min(len(labels), int(12 * inches) // (max(map(len, labels)) + 9)))
     figure.legend(lines, words, loc="outside upper left", ncols=columns, frameon=False)
 
 

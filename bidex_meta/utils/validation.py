@@ -9,6 +9,7 @@ import functools
 import itertools
 import math
 import operator
+import os
 import re
 import types
 from collections.abc import Collection
@@ -63,10 +64,11 @@ def check_fields(settings: object, name: str, as_flags: bool = False, unresolved
 
     Fields whose annotation is not a plain type (such as a path or a function) are not checked. Messages call the
     instance ``name``; with ``as_flags`` they name the field as a flag of the command line. Fields in ``unresolved`` may
-    be None.
+    be None. Paths and NumPy numbers in fields become strings and Python's numbers.
     """
     for field, hint in _hints(type(settings)).items():
-        value = getattr(settings, field)
+        value = builtin(getattr(settings, field))
+        object.__setattr__(settings, field, value)  # the dataclass may be frozen
         if value is None and field in unresolved:
             continue
         try:
@@ -77,6 +79,19 @@ def check_fields(settings: object, name: str, as_flags: bool = False, unresolved
             else:
                 shown = field
             raise BidexError(f"{name}: {_message(error, value, hint, shown)}") from None
+
+
+def builtin(value: Any) -> Any:
+    """Return paths as strings and NumPy numbers as Python's, also within tuples, lists and dicts."""
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if isinstance(value, np.generic):
+        return value.item()
+    if type(value) in (tuple, list):
+        return type(value)(map(builtin, value))
+    if type(value) is dict:
+        return {key: builtin(each) for key, each in value.items()}
+    return value
 
 
 def refuse_unused(settings: Any, names: Collection[str], where: str) -> None:

@@ -22,6 +22,22 @@ def one_torch_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+@contextmanager
+def torch_settings_kept() -> Iterator[None]:
+    """Restore the number of torch's threads and its choice of algorithms at the end of a block or decorated function.
+
+    The caller's own work with torch would otherwise go on with the settings of a run.
+    """
+    threads = torch.get_num_threads()
+    deterministic = torch.are_deterministic_algorithms_enabled()
+    warns = torch.is_deterministic_algorithms_warn_only_enabled()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        torch.use_deterministic_algorithms(deterministic, warn_only=warns)
+
+
 def set_up_torch(threads: int, deterministic: bool = False) -> None:
     """Set the number of torch's threads, and the memory settings of the process for training.
 

@@ -4,9 +4,12 @@ import json
 import logging
 import os
 import signal
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -179,10 +182,35 @@ def test_the_policy_of_a_run_is_recorded_on_the_tasks_of_the_run(tmp_path: Path)
     assert implied([found])["tasks_per_class"] == 2
 
 
-def test_a_run_leaves_torch_as_the_next_one_needs_it(toy_worlds: None, tmp_path: Path) -> None:
-    for number, deterministic in enumerate((True, False)):
-        train(replace(CONFIG, deterministic=deterministic), run_dir=tmp_path / str(number))
-        assert torch.are_deterministic_algorithms_enabled() is deterministic
+def test_a_run_leaves_torch_as_it_was(toy_worlds: None, tmp_path: Path) -> None:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        run = train(replace(CONFIG, deterministic=True), run_dir=tmp_path / "r")
+        evaluate(run, device="cpu")
+        assert torch.get_num_threads() == 3 and not torch.are_deterministic_algorithms_enabled()
+    finally:
+        torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize("context", [torch.no_grad, torch.inference_mode])
+def test_a_run_learns_where_gradients_are_off(toy_worlds: None, tmp_path: Path, context: Callable[[], Any]) -> None:
+    with context():
+        run = train(CONFIG, run_dir=tmp_path / "without")
+    assert same(final(run), final(train(CONFIG, run_dir=tmp_path / "with")))
+
+
+def test_paths_and_numbers_of_numpy_are_taken(tmp_path: Path) -> None:
+    learner = {"gamma": np.float32(0.5), "rollout_steps": np.int64(4)}
+    given = RunConfig(suite=tmp_path / "a.toml", teacher=(tmp_path,), seed=np.int64(3), learner=learner)  # type: ignore[arg-type]
+    assert (given.suite, given.teacher, given.seed) == (str(tmp_path / "a.toml"), (str(tmp_path),), 3)
+    assert given.learner == {"gamma": 0.5, "rollout_steps": 4} and type(given.learner["gamma"]) is float
+    json.dumps(given.to_json())
+
+
+def test_a_run_makes_at_least_one_step() -> None:
+    with pytest.raises(BidexError, match="--steps: expected a whole number >= 1, got 0"):
+        RunConfig(suite="MT4", steps=0)
 
 
 def test_a_transfer_needs_held_out_classes_and_ppo(toy_worlds: None, tmp_path: Path) -> None:

@@ -203,6 +203,8 @@ def test_one_sweep_works_in_a_folder_and_a_changed_file_is_noticed(file: Path, t
     assert (state(run, CONFIG).state, state(others, CONFIG).state) == ("done", "left"), "it is evaluated again"
     with pytest.raises(BidexError, match="has trained for 6 steps, expected at most 3"):
         state(run, replace(CONFIG, steps=3))
+    with pytest.raises(BidexError, match="has ended with evaluate_every None, expected 2"):
+        state(run, replace(CONFIG, evaluate_every=2))
     limited = replace(CONFIG, steps=100, minutes=0.5)
     assert state(run, limited).state == "left", "it had no time limit and six steps before"
 

@@ -86,6 +86,8 @@ def test_what_is_not_finite_is_one_line(what: str, shape: tuple[int, ...], value
     dataset = written(tmp_path, STATE, Box(-1.0, 1.0, (2,), np.float32), **{what: values})
     with pytest.raises(BidexError, match=f"^other/mine-v0: expected {what} that are finite .* in episode 0. Leave"):
         join([dataset], world())
+    with pytest.raises(BidexError, match=f"^other/mine-v0: expected {what} that are finite .* in episode 0. Leave"):
+        dataset.transitions()
     assert f"{what} that are not finite as float32" in verify(dataset).wrong[0]
 
 

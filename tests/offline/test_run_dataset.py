@@ -103,6 +103,7 @@ def test_what_does_not_go_together_is_refused(folder: Path, capsys: pytest.Captu
         ("--suite MT4 --algo bc", "Add --dataset NAME"),
         ("--dataset MT4/random-v0 --algo mtppo", "goes with bc, bcq, td3bc, iql"),
         ("--dataset MT4/random-v0 --algo bc --record 10", "nothing to record"),
+        ("--dataset MT4/random-v0 --algo bc --stop-at-success 0.5", "Add for example --evaluate-every 50"),
         ("--dataset MT4/rand-v0 --algo bc", "Unknown data set 'MT4/rand-v0'. Did you mean"),
         ("--dataset ML4/random-v0 --suite MT4 --algo bc", "ML4/random-v0 hides goals, MT4 shows"),
     ):

@@ -30,8 +30,9 @@ def summary(success: float) -> Summary:
 
 
 def run(
-    arm: str, seed: int, *success: float, suite: str = SUITE, hidden: float | None = None, unseen: float | None = None
-) -> Any:
+    arm: str, seed: int, *success: float, suite: str = SUITE, hidden: float | None = None, unseen: float | None = None,
+    rollouts: int = 1
+) -> Any:  # fmt: skip
     """A stored run: of a learner that adapts if there is success after several numbers of episodes."""
     if len(success) == 1:
         other_tasks = None if unseen is None else OtherTasks(policy=summary(unseen))
@@ -40,11 +41,11 @@ def run(
     else:
         shots = [summary(share) for share in success]
         split = SplitSummary(
-            split="test", shots=2, rollouts=1, trials=1, before=shots[0], after=shots[-1], by_shot=shots,
+            split="test", shots=2, rollouts=rollouts, trials=1, before=shots[0], after=shots[-1], by_shot=shots,
             rewards_shown=True, hidden_by_shot=None if hidden is None else [summary(hidden)] * 3,
         )  # fmt: skip
         found = MetaTestEvaluation(splits={"test": split})
-        algo = arm if arm == "icl" else "rl2"
+        algo = arm if arm in ("icl", "maml") else "rl2"
     content = {"steps": 1000, "seconds": 120.0, "suite": {"name": suite}}
     config = SimpleNamespace(algo=algo, seed=seed)
     path = Path("results/data/ladder.json")
@@ -78,10 +79,17 @@ def test_lines_stand_between_goal_shown_and_blind() -> None:
     rows = [cells(line) for line in lines[4:10]]
     assert [row[0] for row in rows] == [SHOWN, "icl", "a", "b", "c", BLIND]
     assert rows[1][1] == "teachers, rewards of other goals" and rows[2][1] == "own rewards"
-    assert rows[2][2:5] == ["3", "1,000", "2"]
-    assert rows[2][5:9] == ["10 % (10 to 10)", "70 % (70 to 70)", "70.5 % (70 to 71)", ""]
+    assert rows[2][2:6] == ["3", "1,000", "2", "1"] and rows[0][5] == ""
+    assert rows[2][6:10] == ["10 % (10 to 10)", "70 % (70 to 70)", "70.5 % (70 to 71)", ""]
     assert rows[2][-1].startswith(f"{100 * (0.705 - 0.1) / (0.91 - 0.1):.0f} %")
     assert rows[0][-1] == rows[-1][-1] == ""
+
+
+def test_a_shot_has_the_episodes_that_environments_of_a_task_share() -> None:
+    alone = run("a", 0, 0.1, 0.2, 0.3, rollouts=25)
+    shared = run("maml", 0, 0.1, 0.2, 0.3, rollouts=25)
+    rows = [cells(line) for line in table(alone, shared)[4:6]]
+    assert [row[5] for row in rows] == ["1", "25"]
 
 
 def test_pairs_are_of_learners_that_see_their_own_rewards() -> None:
@@ -172,7 +180,7 @@ def test_seeds_that_overlap_are_not_separated_and_hidden_rewards_have_a_column()
     runs = [run("a", seed, 0.1, 0.5, level, hidden=level - 0.2) for seed, level in enumerate((0.5, 0.9, 0.7))]
     runs += [run("b", seed, 0.1, 0.4, level) for seed, level in enumerate((0.6, 0.2, 0.4))]
     lines = table(*runs)
-    assert cells(lines[4])[8] == "50 % (30 to 70)" and cells(lines[5])[8] == ""
+    assert cells(lines[4])[9] == "50 % (30 to 70)" and cells(lines[5])[9] == ""
     assert cells(lines[-1])[-1] == "no"
 
 

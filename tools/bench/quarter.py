@@ -110,7 +110,8 @@ def _steps(
     yield _Step("tests", [*tests, "-m", "gpu and not slow and not parity"], 120.0)
     measured = ["--sizes", *map(str, sizes), "--out", str(out / "switches.json")]
     yield _Step("switches", [*bench, "switches", *world, *measured], 240.0)
-    drawn = ["--device", device, "--suites", suite, suite.replace("MT", "ML", 1), "--num-envs", str(max(1, sizes[-1] // 16))]
+    drawn = ["--device", device, "--suites", suite, suite.replace("MT", "ML", 1)]
+    drawn += ["--num-envs", str(max(1, sizes[-1] // 16))]
     yield _Step("pictures", [*bench, "pictures", *drawn, "--out", str(out / "pictures.json")], 90.0)
     for name, (on, algo, preset, share) in TRAININGS.items():
         flags = ["--algo", algo, "--preset", preset, "--device", device, "--num-envs", str(round(share * num_envs))]

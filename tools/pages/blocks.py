@@ -49,8 +49,8 @@ _WITHOUT_STUDY = {
 }
 _FIGURES = {
     "bars": (bars_figure, "Success per class"),
-    "curves": (curves_figure, "Return and success over training"),
-    "ladder-curves": (ladder_figure, "Success against exploring episodes"),
+    "curves": (curves_figure, "Return and success of training episodes, which have exploration noise"),
+    "ladder-curves": (ladder_figure, "Success after each shot of exploring episodes; bands: worst and best seed"),
     "row-curves": (rows_figure, "Return over training, by number of environments"),
 }
 _JOINED = ("ladder", "ladder-suites", "ladder-curves")

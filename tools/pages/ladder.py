@@ -21,6 +21,7 @@ from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.evaluations import ClassSummary, Evaluated, MetaTestEvaluation
 from bidex_meta.runs.stored import StoredRun
 from bidex_meta.suite_files import load_suite, suite_names
+from bidex_meta.training.learner import Capability
 from tools.pages.studies import Study
 from tools.pages.tables import mean_and_range, table
 from tools.pages.validity import share_cell
@@ -35,8 +36,8 @@ SHOWN = "goal-shown PPO"
 _OWN = "own rewards"
 _MARK = " on train tasks"
 _HEAD = (
-    "learner", "given in training", "seeds", "steps", "minutes", "before", "after 1", "after 2", "after 2, hidden",
-    "gap closed",
+    "learner", "given in training", "seeds", "steps", "minutes", "episodes per shot", "before", "after 1", "after 2",
+    "after 2, hidden", "gap closed",
 )  # fmt: skip
 _VALIDITY = {"blind": "blind at best", "named": "named by its start", "identified": "identified"}
 """Figures of ``bidex-meta validity`` and their headings."""
@@ -57,6 +58,8 @@ class Line:
     """Mean success over classes after 0, 1, ... exploring episodes, for each seed. PPO has a single number per seed."""
     hidden: list[float] = field(default_factory=list)
     """Success in an episode with hidden rewards after all exploring episodes, for each seed that has such episodes."""
+    rollouts: set[int] = field(default_factory=set)
+    """Numbers of exploring episodes of a task in one shot; empty if the learner does not explore."""
     steps: list[int] = field(default_factory=list)
     minutes: list[float] = field(default_factory=list)
     on_train_tasks: bool = False
@@ -129,7 +132,10 @@ def _classes(file: Path) -> list[Json]:
 
 
 def ladder_figure(*studies: Study) -> "Figure":
-    """Draw success against exploring episodes: a panel per suite, a line per learner, horizontal lines for PPO."""
+    """Draw success after each shot: a panel per suite, a line per learner, horizontal lines for PPO.
+
+    Bands show the worst and the best seed.
+    """
     panels: dict[str, list[plots.Group]] = {}
     suites = _suites(studies)
     most = max(len(each) for lines in suites.values() for line in lines.values() for each in line.shares)
@@ -142,10 +148,10 @@ def ladder_figure(*studies: Study) -> "Figure":
             else:
                 ends = None, None
             panels[suite].append((name, {"success": plots.Curve(np.arange(most), shares.mean(0), *ends)}))
-    figure = plots.draw_panels(panels, "success", "success", (1.0, "exploring episodes"))
+    figure = plots.draw_panels(panels, "success", "success", (1.0, "shots of exploring episodes"))
     for axis in figure.axes:
         axis.set_xticks(range(most))
-        axis.set_ylim(0.0, 1.0)
+        axis.set_ylim(-0.02, 1.02)  # shows lines at 0 and at 1
     return figure
 
 
@@ -176,8 +182,10 @@ def _suites(studies: Sequence[Study]) -> dict[str, dict[str, Line]]:
         line.on_train_tasks = on_train_tasks
         line.shares.append([float(np.mean([shot[name].success for name in names])) for shot in by_shot])
         evaluation = run.evaluation()
-        if isinstance(evaluation, MetaTestEvaluation) and (shots := evaluation.splits[split].hidden_by_shot):
-            line.hidden.append(float(np.mean([shots[-1].classes[name].success for name in names])))
+        if isinstance(evaluation, MetaTestEvaluation):
+            line.rollouts.add(_episodes_per_shot(run, evaluation, split))
+            if shots := evaluation.splits[split].hidden_by_shot:
+                line.hidden.append(float(np.mean([shots[-1].classes[name].success for name in names])))
         line.steps.append(run.content["steps"])
         line.minutes.append(run.content["seconds"] / 60)
     return {suite: dict(sorted(lines.items(), key=_place)) for suite, lines in sorted(found.items())}
@@ -208,6 +216,16 @@ def _split(evaluation: Evaluated, split: str) -> list[dict[str, ClassSummary]]:
         return [shot.classes for shot in evaluation.splits[split].by_shot]
     unseen = evaluation.other_tasks
     return [evaluation.policy.classes if unseen is None else unseen.policy.classes]
+
+
+def _episodes_per_shot(run: StoredRun, evaluation: MetaTestEvaluation, split: str) -> int:
+    """Return the number of exploring episodes from which a learner adapts to a task in one shot.
+
+    Environments of a task share their episodes, unless the learner adapts in each environment separately.
+    """
+    if Capability.ADAPTS_INDEPENDENTLY in learner_class(run.config().algo).capabilities:
+        return 1
+    return evaluation.splits[split].rollouts
 
 
 def _on_train_tasks(run: StoredRun) -> bool:
@@ -253,7 +271,8 @@ def _row(name: str, line: Line, lines: dict[str, Line]) -> list[str]:
         if gap > _LEAST_GAP:
             closed = mean_and_range(100.0 * (line.last[:, 0] - low) / gap, ".0f", " %")
     steps = f"{int(np.mean(line.steps)):,}"
-    return [name, line.given, str(len(line.shares)), steps, f"{np.mean(line.minutes):.0f}", *shown, closed]
+    rollouts = ", ".join(map(str, sorted(line.rollouts)))
+    return [name, line.given, str(len(line.shares)), steps, f"{np.mean(line.minutes):.0f}", rollouts, *shown, closed]
 
 
 def _pairs(lines: dict[str, Line]) -> Iterator[list[str]]:
