@@ -22,8 +22,8 @@ if TYPE_CHECKING:  # torch is not imported, because lists and help do not need i
 
 Json = dict[str, Any]  # a JSON object
 _BROKEN = (
-    "unstable: the physics broke; no success, and the return of random actions, or its own if lower (where that is "
-    "unknown: of the worst finished episode)"
+    "unstable: the physics broke. These episodes count as failures, with the return of random actions or their own if "
+    "it is lower (where random actions were not measured: with the return of the worst finished episode)"
 )
 
 
@@ -170,7 +170,8 @@ def evaluation_table(title: str, policy: Evaluation, random: Evaluation | None =
 
     With ``random`` the table also has a random policy's results on the same tasks, and the difference.
     """
-    caption = "[..] 95 % bootstrap interval over tasks (of few: episodes); success: by the suite's rule, once or at end"
+    caption = "[..] 95 % bootstrap interval over tasks, or over episodes if there are few tasks"
+    caption += "\nsuccess: by the suite's rule, once or at end"
     headers = ["task", "episodes", "length", "success", "once", "at end", "return [95 %]", "score"]
     if random is not None:
         headers += ["random success", "random return [95 %]", "return above random [95 %]"]
@@ -292,11 +293,11 @@ def meta_test_table(title: str, found: SplitSummary) -> Sheet:
     Each class has a second row if the evaluation episodes were also played with hidden rewards.
     """
     headers = ["task", *(f"success after {shot} [95 %]" for shot in range(found.shots + 1))]
-    caption = f"after 0, 1, ...: after this number of shots, each of {found.rollouts} exploring episodes of a task"
-    caption += "\n[..] 95 % bootstrap interval over tasks (of few: episodes)"
+    caption = f"after 0, 1, ...: after this number of shots; a shot has {found.rollouts} exploring episodes of a task"
+    caption += "\n[..] 95 % bootstrap interval over tasks, or over episodes if there are few tasks"
     if found.shots:
         headers.append("success gained [95 %]")
-        caption += "\ngained: above the same episodes before adaptation; resampled: adaptations, and their episodes"
+        caption += "\ngained: success after the last shot minus success before adaptation, from equal starts"
     headers += ["return before", "return", "score before", "score", "episodes"]
     if any(row.unstable for row in found.after.classes.values()):
         caption += f"\n{_BROKEN}"

@@ -57,7 +57,7 @@ class Portions:
             if list(world.num_slot_tasks) != self._pool_sizes:
                 raise BidexError(
                     f"Expected adapt_world with {self._pool_sizes} tasks in its pools, as world has, got "
-                    f"{list(world.num_slot_tasks)}. Give it as many by set_tasks."
+                    f"{list(world.num_slot_tasks)}. Call set_tasks with the same number of tasks."
                 )
         if self.count == 1 and [len(adaptations) for adaptations in self._adaptations] == self._pool_sizes:
             yield iter(range(1))  # the world keeps its own pools

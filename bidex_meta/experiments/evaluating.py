@@ -120,6 +120,11 @@ class RunMetaTest:
     """Results before and after adaptation by split: ``train``, ``test`` or ``others``."""
     conditions: Conditions
 
+    @property
+    def success(self) -> dict[str, list[float]]:
+        """Return the mean over classes of the success rate after 0, 1, ... shots, in [0, 1], for each split."""
+        return {split: [shot.success for shot in found.by_shot] for split, found in self.splits.items()}
+
     def record(self) -> MetaTestEvaluation:
         """Return the record of the meta-test, as ``evaluation.json`` holds it."""
         subject: dict[str, Any] = {"agent": self.algo, "suite": self.worlds.short_name, "task_seed": self.worlds.seed}
@@ -307,10 +312,10 @@ def meta_test(
     suites that show their goals.
     """
     if isinstance(agent, RunFolder | str | Path):
+        folder = _opened(agent)
         for name, value in (("suite", suite), ("task_seed", task_seed)):
             if value is not None:
                 raise BidexError(f"meta_test: {name}: a run has its own, got {value}. Leave {name} out.")
-        folder = _opened(agent)
         config, worlds = _set_up(folder, device, engine, randomisation)
         if Capability.ADAPTS not in learner_kind(config.algo, config.task).make.capabilities:
             raise BidexError(f"{config.algo} does not adapt to tasks. Use evaluate(run).")

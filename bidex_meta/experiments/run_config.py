@@ -41,7 +41,7 @@ def resolve(config: AnyConfig, where: str = "run") -> AnyConfig:
     device = resolve_device(config.device, source.on_gpu)
     preset, _ = choose_preset(kind, config.preset, device, source.preset)
     if config.preset == "auto" and isinstance(config.learner, LearnerConfig):
-        # Given values have the name of the preset that they equal.
+        # If the given values equal a preset, the run has that preset's name.
         preset = next((name for name, values in kind.presets.items() if values == config.learner), preset)
     num_envs, steps = source.rows_and_steps(device, Capability.ADAPTS in kind.make.capabilities)
     if kind.make.environments_per_class and device == "cpu":

@@ -307,7 +307,12 @@ def _train(
     else:
         seconds = 60.0 * config.minutes
     iterate = partial(
-        runner.train, learner, run.world, total_steps=config.steps, total_seconds=seconds, enough=_early_end(config)
+        runner.train,
+        learner,
+        run.world,
+        total_steps=config.steps,
+        total_seconds=seconds,
+        should_stop=_early_end(config),
     )
     if launch().rank > 0:
         return iterate(record=None)  # the clock of process 0 decides for all

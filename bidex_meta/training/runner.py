@@ -25,9 +25,9 @@ from bidex_meta.world.contract import VectorWorld
 
 # This is the maximum share of a run's time that checkpoints may take.
 _SAVING_SHARE = 0.02
-_WITH_MOMENTS = 3
-_OF_AN_ENTRY = 1024  # bytes of an archive's entry: name, place and alignment
-_OF_A_STEP = 8  # numbers of a step that a replay stores in addition to observation and action
+_ADAM_COPIES = 3
+_BYTES_PER_ENTRY = 1024  # bytes of an archive's entry: name, place and alignment
+_EXTRA_NUMBERS_PER_STEP = 8  # numbers of a step that a replay stores in addition to observation and action
 
 
 def train(
@@ -40,7 +40,7 @@ def train(
     spent_seconds: float = 0.0,
     checkpoint_seconds: float = 60.0,
     watch: Callable[[], dict[str, float]] | None = None,
-    enough: Callable[[Mapping[str, float]], bool] | None = None,
+    should_stop: Callable[[Mapping[str, float]], bool] | None = None,
     last: Mapping[str, float] | None = None,
 ) -> int:
     """Train until ``total_steps`` environment steps are done or ``total_seconds`` are up, whichever comes first.
@@ -49,7 +49,7 @@ def train(
     first world step to the end of an iteration, including checkpoints; metrics contain it as ``Perf/training_time``.
     There is at least one iteration. If any process receives SIGINT, SIGTERM, SIGHUP, SIGUSR1 or SIGUSR2 (unless
     ignored), all processes finish the iteration, save and return. A BrokenPipeError of ``record``, ``watch`` or
-    ``enough`` has the same effect. After SIGINT or SIGTERM, another SIGINT or SIGTERM acts at once.
+    ``should_stop`` has the same effect. After SIGINT or SIGTERM, another SIGINT or SIGTERM acts at once.
 
     Args:
         learner: Learner that trains on ``world``.
@@ -63,15 +63,16 @@ def train(
             always saved at the end.
         watch: Evaluates the learner after each iteration without changing it, and returns metrics. Its time does not
             count as training time.
-        enough: Returns whether the metrics of an iteration end training; process 0 decides. It is None in all processes
-            or in none.
-        last: Metrics of the last iteration of the run that is resumed. If ``enough`` accepts them, nothing is trained.
+        should_stop: Returns whether the metrics of an iteration end training; process 0 decides. It is None in all
+            processes or in none.
+        last: Metrics of the last iteration of the run that is resumed. If ``should_stop`` accepts them, nothing is
+            trained.
 
     Returns the number of the signal that ended training early, else 0. The number is that of SIGPIPE if nobody reads
     the output, and that of SIGTERM if another process received the signal. Raises LostProcess if another process is
     gone; existing checkpoints are kept.
     """
-    if enough is not None and any_process(is_main() and last is not None and enough(last)):
+    if should_stop is not None and any_process(is_main() and last is not None and should_stop(last)):
         return 0  # the run was stopped between its last iteration and the end of its evaluation
     # With several processes, one may be lost at any time, after which nothing can be saved. So the first iteration is
     # saved.
@@ -107,10 +108,10 @@ def train(
                     began_at += time.monotonic() - paused_at
                 if record is not None:
                     record.log(metrics, learner.env_steps)
-                reached = enough is not None and is_main() and enough(metrics)
+                reached = should_stop is not None and is_main() and should_stop(metrics)
             except BrokenPipeError:
                 stop.ask(signal.SIGPIPE if os.name == "posix" else signal.SIGTERM)
-            if enough is not None and any_process(reached):
+            if should_stop is not None and any_process(reached):
                 break
             if any_process(is_main() and time.monotonic() - saved_at >= pause):
                 began = time.monotonic()
@@ -154,8 +155,8 @@ def checkpoint_bytes(learner: Learner, world: VectorWorld, config: object, steps
     ``config`` is the learner's config. Optimisers begin empty, but Adam later stores two moments for each weight, so
     the learner's tensors count three times.
     """
-    width = _numbers(world.single_observation_space) + _numbers(world.single_action_space) + _OF_A_STEP
-    own = _WITH_MOMENTS * _tensor_bytes(learner.state_dict()) + _tensor_bytes(world.state_dict())
+    width = _numbers(world.single_observation_space) + _numbers(world.single_action_space) + _EXTRA_NUMBERS_PER_STEP
+    own = _ADAM_COPIES * _tensor_bytes(learner.state_dict()) + _tensor_bytes(world.state_dict())
     stored = min(learner.bytes_stored(config, world.num_envs, width), 4 * width * steps)
     return world_size() * (own + stored)
 
@@ -169,7 +170,7 @@ def _tensor_bytes(state: object) -> int:
         return sum(_tensor_bytes(part) for part in state.values())
     if isinstance(state, list | tuple):
         return sum(_tensor_bytes(part) for part in state)
-    return getattr(state, "nbytes", 0) + _OF_AN_ENTRY
+    return getattr(state, "nbytes", 0) + _BYTES_PER_ENTRY
 
 
 def resume(learner: Learner, world: VectorWorld, state: State) -> None:

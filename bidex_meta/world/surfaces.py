@@ -249,7 +249,7 @@ def sample(model: mujoco.MjModel, count: int, seed: int = 0) -> Surfaces:
     """
     geoms = visible_geoms(model)
     if not 0 < len(geoms) <= count:
-        raise BidexError(f"Expected at least {len(geoms) or 'a geom and as many'} points, one a geom, got {count}.")
+        raise BidexError(f"Expected at least {len(geoms) or 'a geom and as many'} points, one per geom, got {count}.")
     rng = np.random.default_rng(seed)
     offsets = {geom: rng.random(2) for geom in geoms}
     of_body = body_kinds(model)

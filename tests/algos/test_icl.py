@@ -268,7 +268,7 @@ def test_each_class_has_networks_of_its_own_and_is_told_by_what_is_seen(monkeypa
         given = torch.cat([seen[row], torch.eye(3)[of]])[None]
         encoded = net.encoder(given)[:, 8 * of : 8 * (of + 1)]
         both = torch.nn.functional.elu(encoded + goals[row] @ weight.T + bias)
-        assert torch.allclose(net.pays(seen, goals, task)[0][row], net.paid(both)[:, 0], atol=1e-6)
+        assert torch.allclose(net.decode_reward(seen, goals, task)[0][row], net.paid(both)[:, 0], atol=1e-6)
     actions = net.act(seen, goals[:, 0], task)
     actions[task == 2].sum().backward()
     assert [bool(part.any()) for part in net.head.own[0].weight.grad] == [False, False, True]

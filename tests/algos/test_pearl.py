@@ -61,8 +61,8 @@ def test_the_posterior_is_made_of_the_episodes_of_a_trial() -> None:
     learner.policy.evidence = lambda obs, actions, reward, following: reward[:, None]  # type: ignore[method-assign]
     shown: list[Any] = []
     learner._sample = lambda mean, std: torch.zeros_like(mean)  # type: ignore[method-assign]
-    sums = learner._shown
-    learner._shown = lambda rows, *given: shown.append((rows, *given)) or torch.zeros(len(rows), 4)  # type: ignore[func-returns-value, method-assign]
+    sums = learner._evidence_sum
+    learner._evidence_sum = lambda rows, *given: shown.append((rows, *given)) or torch.zeros(len(rows), 4)  # type: ignore[func-returns-value, method-assign]
     learner.iterate()
     # After 20 steps, rows 0 to 3 have ended six episodes of three steps, and rows 4 to 6 two of seven steps.
     of_short, of_long = ([episodes[rows == row].item() for rows, _, episodes in shown if row in rows] for row in (0, 4))
@@ -84,7 +84,7 @@ def test_transitions_that_the_replay_no_longer_holds_tell_nothing(held: int) -> 
     learner.policy.evidence = lambda obs, actions, reward, following: reward[:, None]  # type: ignore[method-assign]
     assert learner.replay.filled == held and learner.bounds[0, 0].tolist()[:3] == [9, 12, 15]
     rows = torch.arange(4)
-    found = learner._shown(rows, torch.zeros_like(rows), torch.full_like(rows, 2))[:, 0]
+    found = learner._evidence_sum(rows, torch.zeros_like(rows), torch.full_like(rows, 2))[:, 0]
     # Of the trial's steps 9 to 14, a replay of eight steps holds the last three, one of four steps none.
     rewards = learner.replay._steps["rewards"]
     kept = [rewards[step % len(rewards), :4] for step in range(9, 15) if step >= 20 - held]

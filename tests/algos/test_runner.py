@@ -97,7 +97,7 @@ def test_a_signal_ends_after_the_iteration_and_saves(number: signal.Signals):
     assert signal.getsignal(number) is before
 
 
-@pytest.mark.parametrize("where", ["record", "watch", "enough"])
+@pytest.mark.parametrize("where", ["record", "watch", "should_stop"])
 def test_the_end_of_what_reads_the_output_ends_after_the_iteration_and_saves(where: str):
     notes, calls = Notes(), []
 
@@ -105,7 +105,7 @@ def test_the_end_of_what_reads_the_output_ends_after_the_iteration_and_saves(whe
         calls.append(where)
         if len(calls) == 2:
             raise BrokenPipeError
-        return False if where == "enough" else {}
+        return False if where == "should_stop" else {}
 
     if where == "record":
         notes.after = print_something

@@ -65,7 +65,8 @@ def test_beliefs_learn_to_tell_goals_apart_from_rewards_alone() -> None:
         assert apart > 2.0 * spread and log_std[-1].mean() < log_std[0].mean() - 0.3
         # Beliefs of other trials with the same goal predict the rewards; beliefs of trials with the other goal do not.
         off = [
-            learner.net.pays(x, mean[-1:].roll(by, 1))[0] - learner.policy.earned(batch.previous[1]) for by in (2, 1)
+            learner.net.decode_reward(x, mean[-1:].roll(by, 1))[0] - learner.policy.earned(batch.previous[1])
+            for by in (2, 1)
         ]
         same, other = (each[1:].square().mean() for each in off)
     assert same < 0.3 and other > 1.0
@@ -98,13 +99,13 @@ def test_what_is_decoded_is_seen_and_each_belief_is_compared_to_the_last(
             seen[slot, row] = trials.valid[slot - 1, row] and not ended
     assert seen.any(0).all() and not seen.all(1)[1:].all()
     monkeypatch.setattr("bidex_algos.meta.varibad._TIMES", slots)
-    monkeypatch.setattr(net, "pays", lambda x, latent: torch.zeros(len(latent), *x.shape[:2]))
+    monkeypatch.setattr(net, "decode_reward", lambda x, latent: torch.zeros(len(latent), *x.shape[:2]))
     monkeypatch.setattr(
         net, "believe", lambda x, state: (torch.ones(*x.shape[:2], 3), torch.zeros(*x.shape[:2], 3), state)
     )
     for marked, expected in ((~seen, 0.0), (seen, 1.0)):
         monkeypatch.setattr(learner.policy, "earned", lambda reward, marked=marked: marked.float())
-        error, divergence = learner._bound(batch, rows)
+        error, divergence = learner._elbo_terms(batch, rows)
         assert float(error) == pytest.approx(expected)
     # The first of these unit Gaussians at 1 is compared with one at 0.
     assert float(divergence) == pytest.approx(3 * 0.5 * 6 / float(batch.weights.sum()))

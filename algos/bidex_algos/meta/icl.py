@@ -267,7 +267,7 @@ class ICL(TrialLearner):
         """
         policy = self.policy
         paid = steps.paid[:, None].float()
-        mean, log_std = policy.actor.pays(policy.seen(steps.obs, task), policy.goals(steps.goals), task)
+        mean, log_std = policy.actor.decode_reward(policy.seen(steps.obs, task), policy.goals(steps.goals), task)
         off = (mean - policy.earned(steps.rewards)).square()
         unlikely = (0.5 * off * torch.exp(-2.0 * log_std) + log_std) * log_std.detach().exp()
         return self._of_class((unlikely * paid).mean(1)), self._of_class((off * paid).mean(1))

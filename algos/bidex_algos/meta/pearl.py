@@ -164,7 +164,7 @@ class PEARL(MTSAC):
         # transitions per environment through the encoder in each step.
         rows = ended.nonzero().squeeze(1)
         if len(rows):
-            mean, std = self.policy.posterior(self._shown(rows, torch.ones_like(rows), self.played[rows]))
+            mean, std = self.policy.posterior(self._evidence_sum(rows, torch.ones_like(rows), self.played[rows]))
             self.latent[rows] = self._sample(mean, std)
 
     def _sample(self, mean: Tensor, std: Tensor) -> Tensor:
@@ -178,7 +178,7 @@ class PEARL(MTSAC):
         # The remainder of so large a number favours no entry by more than 1 in 2^40 / count.
         return self._uniform(0, 2**40, *shape) % counts.clamp_min(1)
 
-    def _shown(self, rows: Tensor, trial: Tensor, episodes: Tensor) -> Tensor:
+    def _evidence_sum(self, rows: Tensor, trial: Tensor, episodes: Tensor) -> Tensor:
         """Estimate the sum of the evidence in the first ``episodes`` (M,) episodes of a trial, (M, 2 * latent).
 
         The evidence of a transition consists of the terms that the transition adds to the parameters of the posterior.
@@ -212,7 +212,7 @@ class PEARL(MTSAC):
         """Update all networks with the transitions ``draw`` (B) from the tasks of the environments ``rows`` (M,)."""
         episodes = self._uniform(1, self.config.episodes_per_trial, len(rows))
         trial = (self.played[rows] >= episodes).long()
-        mean, std = self.policy.posterior(self._shown(rows, trial, episodes))
+        mean, std = self.policy.posterior(self._evidence_sum(rows, trial, episodes))
         zero = torch.zeros_like(mean)
         divergence = gaussian_kl(mean, std.log(), zero, zero).mean() / world_size()
         latent = self._sample(mean, std)[self.which]

@@ -83,7 +83,7 @@ class BeliefActor(RecurrentNet):
 
         No gradient flows into the encoder and its memory.
         """
-        x, state = self.knowing(x, state)
+        x, state = self.with_belief(x, state)
         return self.actor(x), state
 
     def believe(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -95,12 +95,12 @@ class BeliefActor(RecurrentNet):
         mean, log_std = belief.chunk(2, dim=-1)
         return mean, log_std.clamp(-6.0, 2.0), state
 
-    def pays(self, x: Tensor, latent: Tensor) -> Tensor:
+    def decode_reward(self, x: Tensor, latent: Tensor) -> Tensor:
         """Decode latent samples (K, B, latent) to normalised rewards (K, M, B) of the inputs ``x`` (M, B, inputs)."""
         both = self.activation(self.state(x[..., : self.seen]) + self.task(latent)[:, None])
         return self.paid(both).squeeze(-1)
 
-    def knowing(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+    def with_belief(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Append beliefs to inputs (T, B, inputs), without gradient.
 
         Returns the result (T, B, inputs + 2 latent) and the memory after these steps.
@@ -124,7 +124,7 @@ class BeliefCritic(nn.Module):
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Return the critic's values (T, B, heads) for inputs (T, B, inputs), and the memory after these steps."""
-        x, state = self._actor[0].knowing(x, state)
+        x, state = self._actor[0].with_belief(x, state)
         return self.values(x), state
 
 
@@ -169,7 +169,7 @@ class VariBAD(RL2):
         for number, begin in enumerate(range(0, len(b.obs), b.size)):
             part = slice(begin, begin + b.size)
             x = self.policy.see(b.obs[part], *(previous[part] for previous in b.previous))
-            found.append(self.net.knowing(x, b.actor_states[number])[0])
+            found.append(self.net.with_belief(x, b.actor_states[number])[0])
         self.known = torch.cat(found)
         return b, explained
 
@@ -181,9 +181,9 @@ class VariBAD(RL2):
     def _descend(self, b: Batch, chosen: Tensor) -> Tensor:
         """Take one gradient step of encoder and decoder.
 
-        Returns the reward error and the KL divergence that :meth:`_bound` computes, summed over all processes, (2,).
+        Returns the reward error and the KL divergence of :meth:`_elbo_terms`, summed over all processes, (2,).
         """
-        reward, divergence = self._bound(b, chosen)
+        reward, divergence = self._elbo_terms(b, chosen)
         self.model_adam.zero_grad()
         (reward + self.config.kl_weight / len(b.weights) * divergence).backward()
         found = sum_gradients(self.model, torch.stack([reward, divergence]).detach())
@@ -191,7 +191,7 @@ class VariBAD(RL2):
         self.model_adam.step()
         return found
 
-    def _bound(self, b: Batch, chosen: Tensor) -> tuple[Tensor, Tensor]:
+    def _elbo_terms(self, b: Batch, chosen: Tensor) -> tuple[Tensor, Tensor]:
         """Return this process's part of the two terms of the loss: the reward error and the KL divergence.
 
         ``chosen``, int64 (B,), are the environments whose trials are used. From the beliefs at random times, the
@@ -211,7 +211,7 @@ class VariBAD(RL2):
         paid = torch.cat([torch.zeros_like(valid[:1]), valid[:-1]]).masked_fill(previous[3], 0.0)
         time, step = (torch.randperm(len(x), generator=self.generator, device=x.device)[:k] for k in (_TIMES, _STEPS))
         noise = torch.randn(mean[time].shape, generator=self.generator, device=x.device)
-        off = net.pays(x[step], mean[time] + log_std[time].exp() * noise) - policy.earned(previous[1])[step]
+        off = net.decode_reward(x[step], mean[time] + log_std[time].exp() * noise) - policy.earned(previous[1])[step]
         weights = valid[time][:, None] * paid[step]
         count = all_sum(torch.stack([weights.sum(), valid.sum()])).clamp_min(1.0)
         return (weights * off.square()).sum() / count[0], divergence.sum() / count[1]

@@ -89,7 +89,7 @@ class BeliefNet(nn.Module):
             return torch.zeros(len(seen), dtype=torch.int64, device=seen.device)
         return self.which(seen).argmax(-1)
 
-    def pays(self, seen: Tensor, goals: Tensor, task: Tensor) -> tuple[Tensor, Tensor]:
+    def decode_reward(self, seen: Tensor, goals: Tensor, task: Tensor) -> tuple[Tensor, Tensor]:
         """Predict mean and log standard deviation (B, g) of the rewards for goals (B, g, n) or (g, n).
 
         ``seen`` are observations (B, d), ``task`` are their classes (B,). Observations, by statistics of their class,
@@ -176,7 +176,7 @@ class ModelBelief:
     def _likelihood(self, obs: Tensor, reward: Tensor) -> Tensor:
         policy = self._policy
         task = policy.class_of(obs)
-        mean, log_std = policy.actor.pays(policy.seen(obs, task), policy.goals(self.candidates), task)
+        mean, log_std = policy.actor.decode_reward(policy.seen(obs, task), policy.goals(self.candidates), task)
         off = (policy.earned(reward)[:, None] - mean) / log_std.exp()
         return self._trust * (-0.5 * (_TAIL + 1.0) * torch.log1p(off.square() / _TAIL) - log_std)
 

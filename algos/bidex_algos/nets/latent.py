@@ -11,7 +11,7 @@ from bidex_algos.nets.networks import MLP, Activation, autocast
 from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_algos.nets.policy import SquashedActor, SquashedPolicy
 
-_NOT_NOTED = ("right_hand", "left_hand", "padding", "task_id")
+_NOT_IN_CONTEXT = ("right_hand", "left_hand", "padding", "task_id")
 """Groups that the encoder does not read. An encoder that reads the hands memorises fifty tasks and ignores rewards."""
 
 
@@ -30,9 +30,9 @@ class LatentPolicy(SquashedPolicy):
         super().__init__(ObservationNormaliser(inputs, normalise_observations), actor, low_precision)
         self.size = size
         self.reward_unit = reward_unit
-        self.noted = inputs.columns(*(group.name for group in inputs.groups if group.name not in _NOT_NOTED))
+        self.in_context = inputs.columns(*(group.name for group in inputs.groups if group.name not in _NOT_IN_CONTEXT))
         self.rewards = ObservationNormaliser(1)
-        transition = 2 * self.noted.size + actions + 1
+        transition = 2 * self.in_context.size + actions + 1
         self.encoder = MLP(transition, hidden, 2 * size, 1.0, generator, activation)
 
     def compressed(self, reward: Tensor) -> Tensor:
@@ -48,7 +48,7 @@ class LatentPolicy(SquashedPolicy):
         These are the terms that the transition adds to the two sums that define the posterior. Observations (..., d)
         and rewards (...) are raw.
         """
-        before, after = (self.observations.some(self.noted(x), self.noted) for x in (obs, next_obs))
+        before, after = (self.observations.some(self.in_context(x), self.in_context) for x in (obs, next_obs))
         seen = [before, actions, self.rewards(self.compressed(reward)), after]
         mean, raw = self.encoder(torch.cat(seen, dim=-1)).chunk(2, dim=-1)
         precision = softplus(raw)

@@ -44,7 +44,7 @@ class MTPPOConfig(OnPolicyConfig):
     critic_learning_rate: Positive | None = 1e-3  # Fixed step size for the critic; None: the same as the actor's.
     gradient_surgery: Balancing = "none"
     """Combination of the tasks' policy gradients. none: sum. pcgrad: sum, after removing from each gradient what points
-    against another task's gradient (Yu et al. 2020). cagrad: sum, turned towards the task whose loss it would lower
+    against another task's gradient (Yu et al. 2020). cagrad: sum, changed in favour of the task that it would improve
     least (Liu et al. 2021). famo: sum, weighted so that all losses fall at the same rate (Liu et al. 2023)."""
     demonstration_batch: Count = 256  # With --demonstrations: demonstrated transitions per mini-batch and process.
     demonstration_cloning: Whole = 0  # With --demonstrations: steps of behaviour cloning before the training.

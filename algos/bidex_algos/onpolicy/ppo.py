@@ -187,7 +187,7 @@ class AdaptiveAdams(AdaptiveAdam):
             self.actor.step()
             self.critic.step()
             return
-        # A policy to start from has lowered the shared step size for the actor's sake.
+        # --start-from lowered the shared step size for the actor. The critic learns alone with the original one.
         of_actor = self.rate.clone()
         if self.critic_rate is self.rate:
             self.rate.fill_(self.learning_rate)
