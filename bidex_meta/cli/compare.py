@@ -46,4 +46,4 @@ def main(arguments: Sequence[str]) -> None:
     print_table(plain_table(*class_table(groups)))
     for line in setting_lines(groups):
         print(line)
-    print("IQM over seeds and classes [95 % bootstrap over seeds]. An interval that holds 0 is no difference.")
+    print("IQM over seeds and classes [95 % bootstrap over seeds]. An interval that contains 0 shows no difference.")

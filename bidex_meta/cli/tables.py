@@ -214,7 +214,7 @@ _SPARE = ("once", "at end", "length", "episodes", "random return", "score")
 def result_table(title: str, policy: Evaluation, random: Evaluation) -> Sheet:
     """Return a short form of ``evaluation_table``, with intervals if they fit."""
     headers = ["task", "success", "random", "return [95 %]", "random return"]
-    table = Sheet(headers, title, "[..] 95 % bootstrap interval over tasks")
+    table = Sheet(headers, title, "[..] 95 % bootstrap interval over tasks, or over episodes if there are few tasks")
     rows = policy.to_json()
     others = random.to_json()
     for name, row in rows["classes"].items():
@@ -284,16 +284,22 @@ def print_meta_test(found: "RunMetaTest") -> None:
     if found.steps is not None:
         subject += f", {found.steps:,} steps"
     for split, result in found.splits.items():
-        print_table(meta_test_table(f"{subject}, {split} tasks", result.summary()))
+        table = meta_test_table(f"{subject}, {split} tasks", result.summary(), found.adapts_per_environment)
+        print_table(table)
 
 
-def meta_test_table(title: str, found: SplitSummary) -> Sheet:
+def meta_test_table(title: str, found: SplitSummary, per_environment: bool) -> Sheet:
     """Return a table of success after 0, 1, ... shots, and of the gains from no adaptation to the last shot.
 
-    Each class has a second row if the evaluation episodes were also played with hidden rewards.
+    ``per_environment`` says whether each environment of a task adapts to its own episodes only. Each class has a second
+    row if the evaluation episodes were also played with hidden rewards.
     """
     headers = ["task", *(f"success after {shot} [95 %]" for shot in range(found.shots + 1))]
-    caption = f"after 0, 1, ...: after this number of shots; a shot has {found.rollouts} exploring episodes of a task"
+    if per_environment:
+        shot = f"a shot is one exploring episode; {found.rollouts} environments of a task adapt separately"
+    else:
+        shot = f"a shot has {found.rollouts} exploring episodes of a task"
+    caption = f"after 0, 1, ...: after this number of shots; {shot}"
     caption += "\n[..] 95 % bootstrap interval over tasks, or over episodes if there are few tasks"
     if found.shots:
         headers.append("success gained [95 %]")

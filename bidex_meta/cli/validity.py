@@ -77,7 +77,7 @@ _SHARES = ("blind", "named", "identified", "uniform", "zero", "held", "witness",
 
 def _cells(name: str, row: Json) -> list[str]:
     shares = ["" if row[key] is None else f"{100 * row[key]:.1f} %" for key in _SHARES]
-    shares[_SHARES.index("named")] += f" ({100 * row['chance']:.0f} %)"
+    shares[_SHARES.index("named")] += f" ({100 * row['chance']:.0f} %), R² {row['explained']:.2f}"
     if row["alignment"] is None:
         rank = ""
     else:

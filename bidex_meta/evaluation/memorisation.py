@@ -1,12 +1,14 @@
 """Probes that guess a task from the first observations of its episodes.
 
 A learner that can name the task from its first observation may learn the train tasks by heart instead of adapting (Yin
-et al. 2020, arXiv 1912.03820). There are two probes. The nearest neighbour among other episodes guesses the task, and a
-ridge regression on other episodes guesses what the task hides. If observations do not reveal the task, neither probe
-does better than chance.
+et al. 2020, arXiv 1912.03820). There are three probes. The nearest neighbour among other episodes names the task; so
+does a ridge regression of the tasks' labels. A ridge regression of the hidden values predicts these, and names the task
+that is nearest to its prediction. If observations do not reveal the task, no probe does better than chance. If they
+show the goal, the last probe finds it, also where fifty tasks lie along one number, which labels cannot separate.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,8 +19,8 @@ _FOLDS = 5
 _GUESSES = 500
 """Guesses of each class, over all of its tasks: the share of correct guesses has a standard error of at most 2.3
 points."""
-_RIDGE = 1.0
-"""Weight of the ridge penalty, for standardised observations."""
+_RIDGES = (1e-4, 1e-2, 1.0, 100.0)
+"""Weights of the ridge penalty per sample, for standardised observations. Part of the training samples choose one."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,7 @@ class Memorised:
     """Results of the probes for one class."""
 
     named: float
-    """Share of the episodes whose task the better probe guesses correctly."""
+    """Share of the episodes whose task the best probe guesses correctly."""
     chance: float
     """The same share for random guesses: one over the number of tasks."""
     explained: float
@@ -52,11 +54,14 @@ def memorised(world: World, episodes: int | None = None, seed: int = 0) -> dict[
         labels = np.eye(int(tasks.max()) + 1)[tasks]
         hidden = world.pools[index][tasks]
         targets = np.broadcast_to(labels, (episodes, *labels.shape))
-        guesses = _guesses(seen, targets, np.arange(episodes)[:, None].repeat(len(tasks), 1))
-        named = max(float((guess.argmax(-1) == tasks).mean()) for guess in guesses)
+        resets = np.arange(episodes)[:, None].repeat(len(tasks), 1)
+        guesses = _guesses(seen, targets, resets)
         values = np.broadcast_to(hidden, (episodes, *hidden.shape))
+        named = [guess.argmax(-1) for guess in guesses]
+        named += [_nearest_task(guess, world.pools[index]) for guess in _guesses(seen, values, resets)]
         explained = max(_r2(guess, values) for guess in _guesses(seen, values, tasks[None].repeat(episodes, 0)))
-        found[name] = Memorised(named, 1.0 / labels.shape[1], explained)
+        best = max(float((tasks == guess).mean()) for guess in named)
+        found[name] = Memorised(best, 1.0 / labels.shape[1], explained)
     return found
 
 
@@ -68,9 +73,9 @@ def _standardised(starts: np.ndarray) -> np.ndarray:
 
 
 def _guesses(seen: np.ndarray, targets: np.ndarray, groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cross-validated predictions of ``targets`` (episodes, n, k) by both probes.
+    """Return the cross-validated predictions of ``targets`` (episodes, n, k) by two probes.
 
-    The probes are the nearest neighbour and a ridge regression on the observations ``seen`` (episodes, n, d). Samples
+    These are the nearest neighbour and a ridge regression on the observations ``seen`` (episodes, n, d). Samples
     with the same number in ``groups`` (episodes, n) are in the same fold. A fold is predicted from all other folds.
     """
     x = seen.reshape(-1, seen.shape[-1])
@@ -83,10 +88,33 @@ def _guesses(seen: np.ndarray, targets: np.ndarray, groups: np.ndarray) -> tuple
         train = ~test
         distances = (x[test] ** 2).sum(1)[:, None] + (x[train] ** 2).sum(1) - 2.0 * x[test] @ x[train].T
         nearest[test] = y[train][distances.argmin(1)]
-        mean = y[train].mean(0)
-        square = x[train].T @ x[train] + _RIDGE * len(x) * np.eye(x.shape[1])
-        linear[test] = mean + x[test] @ np.linalg.solve(square, x[train].T @ (y[train] - mean))
+        choosing = fold == (number + 1) % _FOLDS
+        errors = [((part - y[choosing]) ** 2).sum() for part in _ridge(x, y, train & ~choosing, choosing, _RIDGES)]
+        (linear[test],) = _ridge(x, y, train, test, (_RIDGES[int(np.argmin(errors))],))
     return nearest.reshape(targets.shape), linear.reshape(targets.shape)
+
+
+def _ridge(
+    x: np.ndarray, y: np.ndarray, train: np.ndarray, test: np.ndarray, weights: Sequence[float]
+) -> list[np.ndarray]:
+    """Return the predictions of ``y`` (n, k) for the samples in ``test``, one for each weight of the penalty.
+
+    ``train`` and ``test`` are masks (n,) of the samples ``x`` (n, d).
+    """
+    mean = y[train].mean(0)
+    values, vectors = np.linalg.eigh(x[train].T @ x[train])
+    inputs = x[test] @ vectors
+    outputs = vectors.T @ (x[train].T @ (y[train] - mean))
+    penalties = [weight * train.sum() for weight in weights]
+    return [mean + inputs @ (outputs / (np.maximum(values, 0.0) + penalty)[:, None]) for penalty in penalties]
+
+
+def _nearest_task(guess: np.ndarray, pool: np.ndarray) -> np.ndarray:
+    """Return the tasks of ``pool`` (tasks, k) that are nearest to guesses (episodes, n, k) of their hidden values."""
+    scale = pool.std(0)
+    scale = np.where(scale > 1e-12, scale, 1.0)
+    gaps = (guess[..., None, :] - pool) / scale
+    return (gaps**2).sum(-1).argmin(-1)
 
 
 def _r2(guess: np.ndarray, values: np.ndarray) -> float:

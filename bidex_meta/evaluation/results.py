@@ -12,7 +12,13 @@ from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.evaluations import ClassSummary, Estimate, Summary
 from bidex_meta.utils.arguments import checked_arguments
 
-MANY_TASKS = 10  # number of tasks from which intervals resample tasks instead of episodes
+MANY_TASKS = 5
+"""Number of tasks from which intervals resample tasks instead of episodes.
+
+We simulated five tasks of ten episodes that differ much in difficulty: nominal 95 % intervals over tasks contained the
+true value in 87 % of cases, intervals over episodes in 55 %. With ten tasks of four episodes it was 92 and 79 %. Suites
+with up to four tasks per class list all goals that there are.
+"""
 
 
 @dataclass(frozen=True)

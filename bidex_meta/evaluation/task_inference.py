@@ -86,10 +86,11 @@ def blind_ceiling(task: TaskClass, draws: int = 20_000, seed: int = 0) -> float:
 
 
 def listed_ceiling(task: TaskClass, tasks: np.ndarray) -> float:
-    """Compute the largest share of the given tasks (n, size) that one final state solves; 1 if nothing is hidden.
+    """Compute the largest share of the given tasks (n, size) that a final state solves; 1 if nothing is hidden.
 
     The candidates are each task's own goal and the points midway between two goals, where the tolerances of these goals
-    overlap most. All hidden parts of a task must be solved together, so goals that vary together stay together.
+    overlap most. If tasks hide several numbers, another final state may solve more. All hidden parts of a task must be
+    solved together, so goals that vary together stay together.
     """
     space = task.variation_space
     values = torch.from_numpy(tasks)

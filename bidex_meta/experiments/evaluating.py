@@ -115,6 +115,8 @@ class RunMetaTest:
     worlds: Worlds
     steps: int | None
     """Environment steps that the learner was meta-trained for; None for the caller's own agent."""
+    adapts_per_environment: bool
+    """True if each environment adapts only to its own episodes, of which a shot has one."""
     seed: int
     splits: dict[str, MetaEvaluation]
     """Results before and after adaptation by split: ``train``, ``test`` or ``others``."""
@@ -342,7 +344,9 @@ def meta_test(
     )  # fmt: skip
     found = metatest.meta_test(worlds, adaptation, load, options, metatest.splits_of(worlds, split))
     played = conditions(worlds, options.num_envs)
-    result = RunMetaTest(folder, adaptation.name, worlds, steps, options.seed, found, played)
+    result = RunMetaTest(
+        folder, adaptation.name, worlds, steps, adaptation.is_per_environment, options.seed, found, played
+    )
     if save and folder is not None:
         result.save(folder.evaluation_path)
     return result

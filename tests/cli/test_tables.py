@@ -46,7 +46,7 @@ def of_meta_test() -> Sheet:
     adaptations = {name: np.arange(40) // 8 for name in CLASSES}
     protocol = Protocol(rollouts=10, trials=5)
     found = MetaEvaluation(by_shot, adaptations, protocol, [1, 1], [evaluation(seed) for seed in range(3)])
-    return meta_test_table("promp on ML20-v2, test tasks", found.summary())
+    return meta_test_table("promp on ML20-v2, test tasks", found.summary(), per_environment=False)
 
 
 def of_sweep() -> Sheet:

@@ -241,6 +241,27 @@ def test_intervals_know_that_episodes_of_an_adaptation_share_its_luck():
     assert np.diff(shared.interval)[0] > 3 * np.diff(apart.interval)[0]
 
 
+@pytest.mark.parametrize(("tasks", "wider"), [(4, False), (10, True)])
+def test_trials_of_one_task_share_its_difficulty(tasks: int, wider: bool) -> None:
+    """With four tasks these are all that there are, and trials are independent."""
+    trials, episodes = 20, 2
+    adaptation = np.repeat(np.arange(tasks * trials), episodes)
+    task = adaptation % tasks
+    returns = np.random.default_rng(0).normal(0, 1, tasks)[task]
+
+    def result(returns: np.ndarray, tasks: np.ndarray) -> Evaluation:
+        ones = np.ones(len(returns))
+        return Evaluation({"A": ClassResult(returns, ones, ones, tasks, 0)}, 1)
+
+    widths = []
+    for told in (task, adaptation):  # by task, and as if each trial had a task of its own
+        zero = result(0 * returns, told)
+        gain = paired_gains(result(returns, told), zero, {"A": adaptation}).classes["A"]["return"]
+        assert gain is not None and gain.interval is not None and gain.value == pytest.approx(returns.mean())
+        widths.append(float(np.diff(gain.interval)[0]))
+    assert (widths[0] > 3 * widths[1]) == wider
+
+
 @pytest.mark.parametrize(
     ("agent", "place", "keywords", "expected"),
     [

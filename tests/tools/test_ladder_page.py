@@ -99,21 +99,30 @@ def test_pairs_are_of_learners_that_see_their_own_rewards() -> None:
         for line in lines
     )
     pairs = [cells(line) for line in lines[-3:]]
-    assert [(first, second, apart) for first, second, _, apart in pairs] == [
+    assert [(first, second, apart) for first, second, *_, apart in pairs] == [
         ("a", "b", "yes"), ("a", "c", "yes"), ("b", "c", "yes")
     ]  # fmt: skip
-    assert pairs[0][2].startswith("1.00")
+    assert pairs[0][2:4] == ["1.00", "0.10"]  # two of the twenty divisions of six runs are as clear
 
 
 def test_suites_stand_with_their_validity_and_both_lines(tmp_path: Path) -> None:
     rows = {"Door": {"hidden": ["left_angle"], "blind": 0.25, "named": 0.264, "chance": 0.25, "identified": 1.0}}
+    rows["Door"]["explained"] = -0.04
     (tmp_path / "validity").mkdir()
     (tmp_path / "validity" / f"{SUITE}.json").write_text(json.dumps({"classes": rows}))
     runs = learners()
     runs[0].path = tmp_path / "data" / "ladder.json"
     study: Any = SimpleNamespace(split=None, runs=runs)
     row = cells(list(suites_table(study))[2])
-    assert row == [SUITE, "left_angle", "25.0 %", "26.4 % (25 %)", "100.0 %", "10 % (10 to 10)", "91 % (90 to 92)"]
+    assert row == [
+        SUITE,
+        "left_angle",
+        "25.0 %",
+        "26.4 % (25 %), R² -0.04",
+        "100.0 %",
+        "10 % (10 to 10)",
+        "91 % (90 to 92)",
+    ]
     runs[0].path = tmp_path / "elsewhere" / "data" / "ladder.json"
     assert cells(list(suites_table(study))[2])[:5] == [SUITE, "", "", "", ""]
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.statistics import crossed_estimate, probability_of_improvement
+from bidex_meta.evaluation.statistics import probability_of_improvement
 from bidex_meta.experiments.learners import learner_class
 from bidex_meta.runs import plots
 from bidex_meta.runs.atomic import Json
@@ -93,7 +93,7 @@ def ladder_table(*studies: Study) -> Iterator[str]:
         if not any(study.split for study in studies):
             yield from ("", _verdict(suite, lines, pairs))
         if pairs:
-            head = ("first", "second", "probability that the first is better [95 %]", "separated")
+            head = ("first", "second", "probability that the first is better", "p", "separated")
             yield from ("", *table(head, pairs))
 
 
@@ -110,7 +110,7 @@ def suites_table(*studies: Study) -> Iterator[str]:
         hidden = sorted({part for row in classes for part in row["hidden"]})
         cells = [suite, ", ".join(hidden)]
         means = {}
-        for figure in (*_VALIDITY, "chance"):
+        for figure in (*_VALIDITY, "chance", "explained"):
             known = [row[figure] for row in classes if row.get(figure) is not None]
             means[figure] = float(np.mean(known)) if known else None
         cells += [share_cell(means, figure) for figure in _VALIDITY]
@@ -285,13 +285,25 @@ def _pairs(lines: dict[str, Line]) -> Iterator[list[str]]:
     for first, second in combinations(learners, 2):
         one = lines[first].last
         other = lines[second].last
-        found = crossed_estimate(_better, [one], [other])
+        better = probability_of_improvement(one, other)
         apart = bool(one.min() > other.max())
-        yield [first, second, found.text(form=".2f"), "yes" if apart else "no"]
+        yield [first, second, f"{better:.2f}", f"{_exact_p(one, other):.2f}", "yes" if apart else "no"]
 
 
-def _better(one: list[np.ndarray], other: list[np.ndarray]) -> float:
-    return probability_of_improvement(np.hstack(one), np.hstack(other))
+def _exact_p(one: np.ndarray, other: np.ndarray) -> float:
+    """Return the exact two-sided p of a permutation test on the probability of improvement.
+
+    It is the share of divisions of all runs into two groups, of the sizes of ``one`` and ``other``, that differ at
+    least as much. Bootstrap intervals over three runs would contain the true probability in only about 60 % of cases.
+    """
+    runs = np.concatenate((one, other))
+    places = range(len(runs))
+    found = []
+    for chosen in combinations(places, len(one)):
+        rest = [place for place in places if place not in chosen]
+        found.append(abs(probability_of_improvement(runs[list(chosen)], runs[rest]) - 0.5))
+    observed = abs(probability_of_improvement(one, other) - 0.5)
+    return float(np.mean(np.array(found) >= observed - 1e-9))
 
 
 def _verdict(suite: str, lines: dict[str, Line], pairs: Sequence[Sequence[str]]) -> str:

@@ -55,11 +55,11 @@ def read_validity(results: Path, suite: str) -> Json:
 def share_cell(row: Json, figure: str) -> str:
     """Format a class's value of ``figure`` as a percentage, or as "" if it was not measured.
 
-    If ``figure`` is ``named``, the chance level follows in brackets.
+    If ``figure`` is ``named``, the chance level follows in brackets, and then R² of the hidden values of unseen tasks.
     """
     cell = _percent(row.get(figure))
     if figure == "named" and cell:
-        cell += f" ({100 * row['chance']:.0f} %)"
+        cell += f" ({100 * row['chance']:.0f} %), R² {row['explained']:.2f}"
     return cell
 
 
