@@ -81,8 +81,9 @@ class TrialAgent(Protocol):
 
     A trial is a few episodes of one task in each of N environments, with rewards shown in all of them. ``reset`` begins
     trials of other tasks; the size of its mask is N. Then each step calls ``act`` and ``observe``. The next episode of
-    a trial begins without a call, after ``terminated`` or ``truncated``. If ``valid`` is False, ignore the environment:
-    its episode is over and the environment waits for the others, or its physics broke. Tensors are on the device of the
+    a trial begins without a call, after ``terminated`` or ``truncated``. If ``valid`` is False, learn nothing from the
+    environment: its episode is over and the environment waits for the others, or its physics broke. Broken physics ends
+    the episode too: ``truncated`` is then true although ``valid`` is False. Tensors are on the device of the
     world.
 
     ``copy.deepcopy`` must copy what the agent has learned: copies act in the evaluation episodes, and the agent itself

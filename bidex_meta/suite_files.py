@@ -254,6 +254,10 @@ def _object(file: Path, name: str) -> str:
     return name
 
 
+def _names(suite: Suite, split: Split) -> tuple[str, ...]:
+    return tuple(entry.name for entry in suite.split_classes(split))
+
+
 def _check(suite: Suite) -> None:
     _check_unique(suite.file, "classes", [entry.name for entry in suite.classes])
     if suite.kind == "meta":
@@ -265,6 +269,9 @@ def _check(suite: Suite) -> None:
     if suite.splits != expected:
         wanted = f"a {suite.kind} suite with the splits {', '.join(expected)}"
         raise error(suite.file, "classes", wanted, ", ".join(suite.splits), mend)
+    if suite.kind == "meta" and suite.observation == "one-hot" and len({_names(suite, part) for part in SPLITS}) > 1:
+        mend = 'Write observation = "masked", or give each class both splits.'
+        raise error(suite.file, "observation", "masked or plain for splits of different classes", "one-hot", mend)
     if suite.train_tasks is not None:
         check_drawn(f"{suite.file}", suite.classes, suite.train_tasks)
     all_listed = all(entry.tasks for entry in suite.classes)

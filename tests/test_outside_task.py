@@ -131,16 +131,16 @@ def _wrong(folder: Path, name: str, *changes: tuple[str, str]) -> str:
     return f"{name}:SlideBlock"
 
 
-_HALF_NAN = "torch.where(torch.arange(len(distance)) % 2 == 1, torch.nan, distance)"
+_NAN = "torch.where(distance > 0.0, torch.nan, distance)"
 
 
 @pytest.mark.parametrize("mode", ["SAME_STEP", "DISABLED"])
 def test_a_reward_term_that_is_not_finite_names_class_and_term(mode: str, working_folder: Path) -> None:
-    name = _wrong(working_folder, f"nan_reward_{mode}", ('"target": -5.0 * distance', f'"target": {_HALF_NAN}'))
+    name = _wrong(working_folder, f"nan_reward_{mode}", ('"target": -5.0 * distance', f'"target": {_NAN}'))
     world = make_task_world(name, 4, device="cpu", threads=1, autoreset_mode=mode)
     world.reset(seed=0)
     with pytest.raises(
-        BidexError, match=r"SlideBlock\.reward_terms: 'target': .* got nan .*\(2 of 4 environments\)"
+        BidexError, match=r"SlideBlock\.reward_terms: 'target': .* got nan .*\(4 of 4 environments\)"
     ) as raised:
         world.step(torch.zeros(4, 52))
     assert "\n" not in str(raised.value)
@@ -171,7 +171,7 @@ def test_broken_physics_of_a_class_of_ones_own_is_no_fault_of_its_formulas(worki
 def test_a_loss_that_own_rewards_broke_does_not_blame_the_learning_rate(
     working_folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    name = _wrong(working_folder, "nan_in_a_run", ('"target": -5.0 * distance', f'"target": {_HALF_NAN}'))
+    name = _wrong(working_folder, "nan_in_a_run", ('"target": -5.0 * distance', f'"target": {_NAN}'))
     run = ["run", "--task", name, "--algo", "ppo", "--num-envs", "4", "--steps", "64", "--threads", "1"]
     assert main([*run, "--no-evaluate"]) == 2
     shown = capsys.readouterr().err
@@ -249,3 +249,74 @@ def test_what_is_no_task_is_told_in_one_line(name: str, told: str) -> None:
     with pytest.raises(BidexError, match=told) as raised:
         make_task_world(name, 2)
     assert "\n" not in str(raised.value)
+
+
+_SILENT_MISTAKES = {
+    'lambda: norm(state["block/position"] - state.frozen["goal"][:, :3])': (
+        'lambda: norm(state["block/position"].sub_(state.frozen["goal"][:, :3]))',
+        "reward_terms: expected an unchanged state",
+    ),
+    '"target": -5.0 * distance': ('"target": -5.0 * distance / distance.norm()', "row alone, got values that depend"),
+    '"right": -reached': ('"right": torch.rand_like(reached)', "got others in a second call"),
+    "episode_steps = ": ("episode_steps = 10  # ", "episode_steps: expected at least 15"),
+}
+
+
+@pytest.mark.parametrize("right", _SILENT_MISTAKES)
+def test_a_mistake_that_would_only_change_numbers_is_refused(right: str, working_folder: Path) -> None:
+    wrong, told = _SILENT_MISTAKES[right]
+    name = _wrong(working_folder, f"silent_{list(_SILENT_MISTAKES).index(right)}", (right, wrong))
+    rules = 'success = "at-end"\nbase' if "steps" in right else "base"
+    (working_folder / "slides.toml").write_text(SUITE.replace(NAME, name).replace("base", rules))
+    with pytest.raises(BidexError, match=told) as raised:
+        Benchmark("slides.toml").make_world("test", 2, device="cpu", threads=1)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_key_of_a_class_does_not_meet_one_of_ours(working_folder: Path) -> None:
+    change = ('state.once("distance", ', 'state.once("solved", ')
+    name = _wrong(working_folder, "same_key", change)
+    world = make_task_world(name, 2, device="cpu", threads=1)
+    world.reset(seed=0)
+    assert not world.step(torch.zeros(2, 52))[4]["success"].any()
+
+
+def test_two_classes_of_one_name_stay_two(working_folder: Path) -> None:
+    (working_folder / "far.py").write_text(
+        "from my_tasks import SlideBlock\n"
+        "class Far(SlideBlock):\n"
+        "    def reward_terms(self, state):\n"
+        "        return {'seven': 7.0 + 0.0 * self._distance(state)}\n"
+    )
+    suite = SUITE.replace('kind = "meta"', 'kind = "multi-task"').replace('"masked"', '"one-hot"')
+    suite = suite.replace('split = "both"', "").replace('name = "CatchUnderarm"', 'name = "far:Far"')
+    (working_folder / "slides.toml").write_text(suite)
+    world = Benchmark("slides.toml").make_world("train", 4, device="cpu", threads=1)
+    world.reset(seed=0)
+    rewards = world.step(torch.zeros(4, 52))[1]
+    assert rewards[2:].tolist() == [7.0, 7.0] and (rewards[:2] < 2.0).all()
+
+
+def test_hidden_suites_leave_out_goals_and_nothing_else(working_folder: Path) -> None:
+    blocks = '*goal_blocks("goal")'
+    observe = 'return observe_goal(state, "block/quaternion")'
+    changes = [("import goal_blocks,", "import Block, goal_blocks,"), (blocks, f'{blocks}, Block("gap", 1)')]
+    shown = ' | {"gap": 3.0 + 0.0 * state["block/position"][:, :1]}'
+    name = _wrong(working_folder, "with_gap", *changes, (observe, observe + shown))
+    (working_folder / "slides.toml").write_text(SUITE.replace(NAME, name))
+    world = Benchmark("slides.toml").make_world("test", 2, device="cpu", threads=1)
+    obs, _ = world.reset(seed=0)
+    layout = world.slots[0].task_class.layout
+    assert (obs[:, layout.range("gap")] == 3.0).all() and not obs[:, layout.goal_indices()].any()
+    read = (blocks, 'Block("goal", 3, ("block/position",), goal=True)')
+    name = _wrong(working_folder, "read_goal", changes[0], read)
+    with pytest.raises(BidexError, match="expected a goal without sensors"):
+        make_task_world(name, 2, device="cpu", threads=1)
+
+
+def test_a_class_can_extend_ours(working_folder: Path) -> None:
+    (working_folder / "thrown.py").write_text(
+        "from bidex_meta.tasks.catches import CatchUnderarm\nclass Mine(CatchUnderarm):\n    name = 'Mine'\n"
+    )
+    world = make_task_world("thrown:Mine", 2, device="cpu", threads=1)
+    assert world.reset(seed=0)[0].shape == (2, 422) and world.task_names == ["thrown:Mine"]

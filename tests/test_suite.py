@@ -177,6 +177,7 @@ FAULTS = {
     "listed and counted": (LISTED, "version = 1", COUNTED, "tasks_per_class: expected nothing"),
     "value is no number": (LISTED, "goal_x = 0.1", 'goal_x = "0.1"', "classes[0].tasks[1].fixed[...]: expected"),
     "value is not finite": (LISTED, "goal_x = 0.1", "goal_x = nan", "classes[0].tasks[1].fixed[...]: expected"),
+    "ids of other classes in each split": (META, '"masked"', '"one-hot"', "observation: expected masked or plain"),
     "unknown reward": (META, '"paper"', '"v3"', "reward: expected"),
     "unknown variation": (META, "version = 1", 'version = 1\nvariation = "v2"', "variation: expected"),
     "unknown success": (META, "version = 1", 'version = 1\nsuccess = "at_end"', "success: expected"),

@@ -217,7 +217,9 @@ def _explore(agent: MetaLearningAgent, world: TaskWorld, obs: Tensor, playing: T
         valid = running & ~info["unstable"]
         # The world continues with environments whose episodes were cut here; they are ignored until their next reset.
         truncated = truncated | ((limit <= step) & ~terminated)
-        agent.step(Timestep(obs, action, reward, terminated, truncated, outputs, new, valid))
+        # The agent gets copies: it must not be able to end episodes.
+        told = terminated.clone(), truncated.clone()
+        agent.step(Timestep(obs, action, reward, *told, outputs, new, valid.clone()))
         steps += valid.sum()
         running = running & ~(terminated | truncated)
         obs = new

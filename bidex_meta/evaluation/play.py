@@ -103,6 +103,11 @@ def check_world(world: TaskWorld) -> None:
         else:
             name = mode
         raise BidexError(f"Evaluation needs a world in autoreset mode DISABLED, but this one is in {name}.")
+    if getattr(world, "draws_tasks", False):
+        raise BidexError(
+            "Evaluation needs a world whose environments keep their tasks, but this one draws them. Make it with "
+            'task_sampling="fixed".'
+        )
     if len(set(world.task_names)) != len(world.task_names):
         raise BidexError(f"Results are stored by name, but the world's names are not unique: {world.task_names}.")
 
@@ -175,7 +180,8 @@ def agent_step(
         new, reward, terminated, truncated, info = outcome
         valid = running & ~info["unstable"]
         action = torch.as_tensor(action, device=obs.device)
-        observe(Timestep(obs, action, reward, terminated, truncated, {}, new, valid))
+        # The agent gets copies: it must not be able to end episodes.
+        observe(Timestep(obs, action, reward, terminated.clone(), truncated.clone(), {}, new, valid))
     return outcome
 
 

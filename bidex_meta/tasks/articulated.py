@@ -12,12 +12,12 @@ from torch.nn.functional import pad
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.tasks.aligned import Error, Hidden, at_least, within
-from bidex_meta.tasks.base import FAST, THIN
 from bidex_meta.tasks.goals import Ghost, frozen_goal, posed
 from bidex_meta.tasks.layout import goal_blocks, handle_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, SHIFT, TURN, place, placed, yaw_quaternion
 from bidex_meta.tasks.reach import ReachTask, apart
 from bidex_meta.tasks.scene import SceneObject, Table
+from bidex_meta.tasks.solver import FAST, THIN
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import component, join
 from bidex_meta.tasks.words import centimetres, degrees
@@ -382,7 +382,10 @@ class Switch(ReachTask):
         return found
 
     def target(self, state: TaskState) -> Tensor:
-        first, second = (norm(state[f"switch{i}/button_position"] - state.frozen[f"goal{i}"]) for i in (1, 2))
+        goals = [state.frozen[f"goal{i}"] for i in (1, 2)]
+        if self.rules.wide:  # every episode draws the places
+            goals = [state[f"switch{i}/position"] + constant(_PRESSED, goals[0]) for i in (1, 2)]
+        first, second = (norm(state[f"switch{i}/button_position"] - goal) for i, goal in enumerate(goals, start=1))
         return 50.0 * (1.4 - (first + second))
 
     def success(self, state: TaskState) -> Tensor:

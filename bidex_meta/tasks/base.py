@@ -1,11 +1,10 @@
-"""The base class of all task classes, and the contact solver settings that a class may choose."""
+"""The base class of all task classes."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from itertools import chain
 from types import MappingProxyType
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import mujoco
 import numpy as np
@@ -17,64 +16,18 @@ from bidex_meta.errors import BidexError
 from bidex_meta.hands.hand import hand
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.hands.starts import meets_box, noisy_joints
-from bidex_meta.rules import CONTROL_RATE, V1, Rules
+from bidex_meta.rules import V1, Rules
 from bidex_meta.tasks.aligned import Error, Hidden, aligned_terms
 from bidex_meta.tasks.goals import Ghost
 from bidex_meta.tasks.layout import Block, Layout, both_hands
+from bidex_meta.tasks.solver import Solver
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import NO_COMPONENTS, VariationSpace
-from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.maths import constant, indices
 from bidex_meta.utils.validation import Count, Finite, NonNegative, Point, Positive, Text, Whole, true_or_false
 
-
-@checked_arguments
-@dataclass(frozen=True)
-class Solver:
-    """Settings of MuJoCo's contact solver for one task class.
-
-    bidex_meta/hands/README.md describes the settings that are the same for all classes.
-
-    Attributes:
-        iterations: Maximum number of Newton iterations.
-        line_search: Maximum number of steps of each line search.
-        integrator: MuJoCo's integration method.
-        cone: Shape of the friction cones. An elliptic cone is exact. A pyramid takes 25 to 33 % less time and lets
-            objects slip a little.
-        impratio: Stiffness of friction relative to the normal force; a higher ratio makes held objects creep less.
-        time_step: Length of a physics step, seconds; a whole number of physics steps must make a control step. Contacts
-            and joint limits are as stiff as this time step allows.
-        most_condim: Largest dimension of a contact. 4 includes torsional friction, which eggs and fingertips have; 3
-            does not.
-    """
-
-    iterations: Count = 10
-    line_search: Count = 20
-    integrator: mujoco.mjtIntegrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    cone: mujoco.mjtCone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    impratio: Positive = 10.0
-    time_step: Positive = 1.0 / 120.0
-    most_condim: Literal[1, 3, 4, 6] = 4
-
-    def __post_init__(self) -> None:
-        steps = 1.0 / (CONTROL_RATE * self.time_step)
-        if abs(steps - max(round(steps), 1)) > 1e-6:
-            raise BidexError(
-                f"Solver: time_step: expected a whole number of them to a control step of 1/{CONTROL_RATE} s, got "
-                f"{self.time_step}. Write 1 / 120, 1 / 180 or 1 / 240."
-            )
-
-
-LIGHT = Solver(cone=mujoco.mjtCone.mjCONE_PYRAMIDAL, impratio=3.0, time_step=1.0 / 180.0, most_condim=3)
-"""For eggs. Hands hold an egg for only a second, so that it may creep by a millimetre per second."""
-GENTLE = replace(LIGHT, time_step=1.0 / 120.0)
-"""For an egg that is thrown across a narrow gap, where nothing moves fast."""
-FIRM = Solver(100, 50)
-"""For light bodies between hands and table. With the default iterations the solver would stop early and kick them."""
-FAST = Solver(100, 50, time_step=1.0 / 180.0)
-"""For fast bases near rigid objects. In a time step of 1/120 s a hand at full speed sinks 24 mm into a table."""
-THIN = Solver(100, 50, time_step=1.0 / 240.0)
-"""For fast bases that press objects as thin as a finger against a table."""
+_SOLVED = object()
+"""Key under which a state keeps the result of ``success``; no key of a user's own class can equal it."""
 JITTER, JOINT_NOISE = 0.005, 0.1
 """Half width of a fixture's shift in jittered starts, metres, and joint noise as a share of each joint's range."""
 
@@ -232,9 +185,16 @@ class TaskClass(ABC):
         return self.freeze(drawn[:, indices(self._order, drawn)])
 
     @property
+    def is_shipped(self) -> bool:
+        """Return whether the class is one of ours, whose formulas are tested."""
+        return type(self).__module__.startswith("bidex_meta.")
+
+    @property
     def scene_key(self) -> tuple[Hashable, ...]:
         """Return the values that determine the compiled scene; classes with equal keys may share it."""
-        return self.name, self.moving_base, self.rules, self.touch
+        # Our own classes add the options that change a scene.
+        options = () if self.is_shipped else sorted(self.chosen.items())
+        return type(self), self.name, self.moving_base, self.rules, self.touch, *options
 
     @property
     def observation_size(self) -> int:
@@ -378,7 +338,7 @@ class TaskClass(ABC):
 
         ``success`` is computed only once per state, because the reward and the world both read its result.
         """
-        return state.once("solved", lambda: self.success(state))
+        return state.once(_SOLVED, lambda: self.success(state))
 
     def rewards(self, state: TaskState) -> dict[str, Tensor]:
         """Return the terms of the reward that the suite's rules choose, each (n,), by name; the reward is their sum."""

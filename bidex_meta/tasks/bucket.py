@@ -15,12 +15,12 @@ from torch.nn.functional import pad
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
 from bidex_meta.tasks.aligned import Error, Hidden, at_least, within
-from bidex_meta.tasks.base import FAST, THIN
 from bidex_meta.tasks.goals import Ghost, frozen_goal, posed
 from bidex_meta.tasks.layout import Block, goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, SHIFT, TURN, placed, yaw_quaternion
 from bidex_meta.tasks.reach import ReachTask, apart
 from bidex_meta.tasks.scene import Point, SceneObject, Table
+from bidex_meta.tasks.solver import FAST, THIN
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import component, join
 from bidex_meta.tasks.words import centimetres

@@ -8,8 +8,8 @@ from typing import ClassVar
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
-from bidex_meta.tasks.base import GENTLE
 from bidex_meta.tasks.eggs import EggTask, goal_object_blocks
+from bidex_meta.tasks.solver import GENTLE
 
 
 class CatchUnderarm(EggTask):

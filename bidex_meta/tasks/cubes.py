@@ -14,12 +14,13 @@ from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_DOWN_AWAY, PALM_DOWN_BACK, PALM_UP_AWAY, PALM_UP_BACK, HandPose
 from bidex_meta.tasks import eggs
 from bidex_meta.tasks.aligned import Error, Hidden, within
-from bidex_meta.tasks.base import FAST, FIRM, TaskClass
+from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.goals import GREEN, Ghost, frozen_goal, posed
 from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, SHIFT, TURN, placed
 from bidex_meta.tasks.reach import ReachTask
 from bidex_meta.tasks.scene import Point, SceneObject, Table
+from bidex_meta.tasks.solver import FAST, FIRM
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import component, join, orientation
 from bidex_meta.tasks.words import centimetres, degrees

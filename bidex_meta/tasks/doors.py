@@ -17,11 +17,11 @@ from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.hand import SIDES
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
 from bidex_meta.tasks.aligned import Error, Hidden, at_least, within
-from bidex_meta.tasks.base import FAST
 from bidex_meta.tasks.goals import Ghost, frozen_goal, posed
 from bidex_meta.tasks.layout import goal_blocks, handle_blocks, object_blocks
 from bidex_meta.tasks.reach import ReachTask, apart
 from bidex_meta.tasks.scene import Point, SceneObject
+from bidex_meta.tasks.solver import FAST
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace, component, join
 from bidex_meta.tasks.words import degrees

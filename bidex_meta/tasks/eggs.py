@@ -13,11 +13,12 @@ from bidex_meta.hands.hand import SIDES
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.hands.starts import make_room, noisy_joints
 from bidex_meta.tasks.aligned import Error, Hidden, within
-from bidex_meta.tasks.base import JITTER, JOINT_NOISE, LIGHT, TaskClass
+from bidex_meta.tasks.base import JITTER, JOINT_NOISE, TaskClass
 from bidex_meta.tasks.goals import Ghost, frozen_goal, observe_goal, rotation_difference
 from bidex_meta.tasks.layout import Block, goal_blocks, object_blocks
 from bidex_meta.tasks.objects.held import EGG, HeldObject, held_object
 from bidex_meta.tasks.scene import Point, SceneObject
+from bidex_meta.tasks.solver import LIGHT
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace, box, join, orientation
 from bidex_meta.tasks.words import centimetres

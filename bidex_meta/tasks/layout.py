@@ -46,6 +46,13 @@ class Block:
     saturates: bool = False
     description: str = ""
 
+    def __post_init__(self) -> None:
+        if self.goal and self.sensors:
+            raise BidexError(
+                f"Block {self.name!r}: expected a goal without sensors, because suites that hide goals only leave out "
+                f"what observe() computes; got {', '.join(self.sensors)}. Compute the block in observe()."
+            )
+
 
 @checked_arguments
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import importlib
 import inspect
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,6 +24,9 @@ _MODULES = {
     "ReOrientation": "cubes", "OpenPenCap": "articulated", "Switch": "articulated", "StackBlock": "cubes",
     "PourWater": "bucket", "GraspAndPlace": "bucket",
 }  # fmt: skip
+
+_OF_INSTANCE = "variation_space"
+"""Attribute that a class may also set in ``__init__``, as EggTask does."""
 
 
 def names() -> list[str]:
@@ -104,6 +107,8 @@ def get(name: str, moving_base: bool | None = None, touch: bool = False, **optio
             raise unknown_name(f"option of {name}", option, known)
     check_object(options.get("object"))
     made = task_class(moving_base, **options)
+    if not hasattr(made, _OF_INSTANCE):
+        _check_has(name, [_OF_INSTANCE])
     made.touch = true_or_false("touch", touch)
     made.chosen = {option: parameter.default for option, parameter in known.items()} | options
     if name != plain:
@@ -117,8 +122,12 @@ def _outside(name: str) -> "type[TaskClass]":
     found, _ = outside_class(name, "task")
     if not issubclass(found, TaskClass):
         raise BidexError(f"task {name}: expected a subclass of bidex_meta.tasks.base.TaskClass, got {found!r}.")
-    missing = [*sorted(found.__abstractmethods__), *(x for x in TaskClass.__annotations__ if not hasattr(found, x))]
-    if missing:
-        raise BidexError(f"task {name}: expected the class to have {', '.join(missing)}. See docs/own-task.md.")
+    attributes = TaskClass.__annotations__.keys() - {_OF_INSTANCE}
+    _check_has(name, [*sorted(found.__abstractmethods__), *sorted(x for x in attributes if not hasattr(found, x))])
     check_attributes(found, TaskClass, f"task {name}")
     return found
+
+
+def _check_has(name: str, missing: Sequence[str]) -> None:
+    if missing:
+        raise BidexError(f"task {name}: expected the class to have {', '.join(missing)}. See docs/own-task.md.")

@@ -14,13 +14,13 @@ from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.hand import hand
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, PALM_UP_AWAY, PALM_UP_BACK, HandPose
 from bidex_meta.tasks.aligned import Error, Hidden, at_least, within
-from bidex_meta.tasks.base import FAST, FIRM
 from bidex_meta.tasks.goals import Ghost, frozen_goal, posed, rotation_difference
 from bidex_meta.tasks.layout import goal_blocks, handle_blocks, object_blocks, point_block
 from bidex_meta.tasks.objects.pointed import OwnObjectClass
 from bidex_meta.tasks.placement import DRAWS, SHIFT, TURN, place, placed, yaw_quaternion
 from bidex_meta.tasks.reach import apart
 from bidex_meta.tasks.scene import SceneObject, Table
+from bidex_meta.tasks.solver import FAST, FIRM
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace, component, join
 from bidex_meta.tasks.words import centimetres, degrees

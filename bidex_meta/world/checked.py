@@ -1,6 +1,6 @@
 """Checks of all arguments, actions, states and formulas that a world is given; they run before anything changes."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
 import numpy as np
@@ -12,9 +12,6 @@ from torch import Tensor
 from bidex_meta.engine.health import checked_state, dense
 from bidex_meta.engine.switches import Switches
 from bidex_meta.errors import BidexError, one_line, shortened, unknown_name
-from bidex_meta.tasks.base import TaskClass
-from bidex_meta.tasks.scene import Scene
-from bidex_meta.tasks.state import TaskState
 from bidex_meta.utils.maths import check_precision
 from bidex_meta.utils.validation import whole_number
 from bidex_meta.world.contract import State
@@ -33,9 +30,6 @@ MOST_EPISODES = 1000
 """Maximum number of episodes that play one task before another is drawn, and maximum number of episodes in a trial."""
 _TOLD, _LONGEST = 5, 100
 """Maximum number of differences that a message names, and maximum number of letters for each."""
-_ROWS = 11
-"""Number of rows on which formulas are tried. No sensor and no block has this size, so that a tensor's axis of rows can
-be recognised by its size."""
 
 
 def num_envs(given: object, slots: Sequence[str]) -> int:
@@ -210,91 +204,3 @@ def _check_tensor(name: str, given: object, own: Tensor) -> None:
         raise BidexError(f"Expected finite numbers in {what}, got others; take an older state.")
     if given.dtype == torch.int64 and bool((given < _LEAST.get(name, 0)).any()):
         raise BidexError(f"Expected counts in {what}, got some below zero; take an older state.")
-
-
-def formulas(scene: Scene, tasks: np.ndarray, sensors: Tensor, observed: bool) -> None:
-    """Check a class's formulas: call the class's methods once, and check the returned values.
-
-    The methods get a few rows that all have the first of ``tasks``, and sensors that all read 0. Precision and device
-    are those of ``sensors``. ``observed`` says whether ``observe`` is called too. Raises BidexError if a method returns
-    anything but what is expected; the message names class, method, what was expected and what was returned.
-    """
-    task = scene.task
-    name = type(task).__name__
-    for block, _ in task.layout:
-        size = sum(scene.sensor(sensor).stop - scene.sensor(sensor).start for sensor in block.sensors)
-        if block.sensors and size != block.size:
-            raise BidexError(f"{name}.layout: block {block.name!r} has size {block.size}, its sensors give {size}.")
-    variations = torch.as_tensor(tasks[:1]).to(sensors).repeat(_ROWS, 1)
-    frozen = _named(f"{name}.freeze", task.frozen(variations))
-    for key, value in frozen.items():
-        _check_shape(f"{name}.freeze: {key!r}", value, None)
-    state = TaskState(sensors.new_zeros(_ROWS, scene.model.nsensordata), scene.sensors, frozen)
-    for key, value in _named(f"{name}.reward_terms", task.rewards(state)).items():
-        _check_shape(f"{name}.reward_terms: {key!r}", value)
-    _check_shape(f"{name}.success", task.success(state), kind=torch.bool)
-    _check_shape(f"{name}.failed", task.failed(state), kind=torch.bool)
-    sizes = {block.name: block.size for block, _ in task.layout}
-    blocks = task.observe(state) if observed else {}
-    for key, value in blocks.items():
-        if key not in sizes:
-            raise BidexError(f"{name}.observe: expected blocks of the layout ({', '.join(sizes)}), got {key!r}.")
-        _check_shape(f"{name}.observe: {key!r}", value, sizes[key])
-
-
-def own_numbers(
-    task: TaskClass,
-    method: str,
-    values: Mapping[str, Tensor],
-    unstable: Callable[[], Tensor] | None = None,
-    rows: Tensor | slice = slice(None),
-) -> None:
-    """Raise BidexError if a user's own class returned numbers that are not finite in environments with sound physics.
-
-    ``values`` maps names to tensors (n, ...) with one row per environment in ``rows``. ``unstable()`` returns a mask,
-    bool (num,), of all environments with broken physics. Shipped classes are not checked, because their formulas are
-    tested.
-    """
-    if type(task).__module__.startswith("bidex_meta."):
-        return
-    for name, value in values.items():
-        bad = ~value.isfinite().reshape(len(value), -1).all(dim=1)
-        if bool(bad.any()) and unstable is not None:
-            bad = bad & ~unstable()[rows]
-        if bool(bad.any()):
-            row = int(bad.nonzero()[0])
-            where = f"{type(task).__name__}.{method}: {name!r}"
-            raise BidexError(
-                f"{where}: expected finite numbers, got {shortened(value[row].tolist())} in a state whose physics is "
-                f"sound ({int(bad.sum())} of {len(bad)} environments). Look for a division by 0, a root or logarithm "
-                "of a negative number, or exp of a large one."
-            )
-
-
-def _named(where: str, given: object) -> dict[str, Tensor]:
-    if not isinstance(given, dict) or not given:
-        raise BidexError(f"{where}: expected a dict from names to tensors, got {shortened(given)}.")
-    return given
-
-
-def _check_shape(where: str, value: object, *sizes: int | None, kind: torch.dtype | None = None) -> None:
-    expected = (_ROWS, *sizes)
-    if isinstance(value, Tensor):
-        pairs = zip(expected, value.shape, strict=False)
-        fitting = value.dim() == len(expected) and all(size in (None, own) for size, own in pairs)
-        if fitting and kind in (None, value.dtype):
-            return
-        got = f"{_shown(tuple(value.shape))} of {str(value.dtype).removeprefix('torch.')}"
-    else:
-        got = shortened(value)
-    if kind is None:
-        kinds = ""
-    else:
-        kinds = f" of {str(kind).removeprefix('torch.')}"
-    raise BidexError(f"{where}: expected a tensor of shape {_shown(expected)}{kinds}, where n counts rows, got {got}.")
-
-
-def _shown(shape: tuple[int | None, ...]) -> str:
-    letters = {_ROWS: "n", None: "k"}
-    words = [letters.get(size, str(size)) for size in shape]
-    return f"({', '.join(words)}{',' * (len(words) == 1)})"

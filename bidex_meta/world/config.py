@@ -30,7 +30,7 @@ class WorldConfig:
             member or its name.
         observation: "plain", "one-hot" (task id appended) or "masked" (goal entries zero).
         pad_to: Number of observation entries before the task id; None: the number of the widest class.
-        task_sampling: "uniform": each autoreset draws a task of the pool; "fixed": environment j keeps task j mod n;
+        task_sampling: "uniform": each episode draws a task of the pool; "fixed": environment j keeps task j mod n;
             "fresh": each episode draws a new task of its class's space; in DISABLED mode this means "fixed".
         episodes_per_task: Number of consecutive episodes that play one task, if episodes draw tasks.
         threads: Engine threads; None: all CPUs. Trajectories do not depend on the number.

@@ -8,58 +8,18 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from bidex_meta.hands.hand import FORCE_PER_SCALE, SIDES, TORQUE_PER_SCALE, hand
 from bidex_meta.rules import CONTROL_RATE
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.layout import CLIP
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.utils.maths import multiply, roll_pitch_yaw, xyzw
-from bidex_meta.world import checked
 from bidex_meta.world.base import Transition
+from bidex_meta.world.controls import Controls
 from bidex_meta.world.depth_sensor import DepthSensor
+from bidex_meta.world.formulas import check_formulas, check_numbers
 from bidex_meta.world.graphs import Together
 from bidex_meta.world.groups import Group, Member, Slot
 from bidex_meta.world.observations import Observer, Rule
-
-
-class Controls:
-    """Writes actions into a group's engine: targets for the joints, forces and torques for the bases.
-
-    An action begins with the right hand. Each hand has entries for 20 joints, 3 base translations and 3 base rotations,
-    in this order (the paper's Tables 9 and 11). Hands with fixed bases have only the joints' entries.
-    """
-
-    def __init__(self, group: Group) -> None:
-        engine = group.engine
-        scene = group.members[0].scene
-        self._engine = engine
-        self._moving = scene.task.moving_base
-        low, high = (engine.ctrl.new_tensor(x) for x in (hand().control_low, hand().control_high))
-        self._middle = 0.5 * (high + low)
-        self._half = 0.5 * (high - low)
-        self._joints = len(low)
-        self._bodies = scene.base_bodies
-        self._wrench = engine.ctrl.new_empty(engine.num, 6)
-        for member in group.members:
-            task = member.scene.task
-            self._wrench[member.engine_rows, :3] = FORCE_PER_SCALE * task.transition_scale
-            self._wrench[member.engine_rows, 3:] = TORQUE_PER_SCALE * task.orientation_scale
-
-    def write(self, action: Tensor) -> None:
-        """Write actions into the engine: targets of joints, and force (N) and torque (N m) on moving bases.
-
-        ``action`` (num, 52), or (num, 40) for fixed bases, is within [-1, 1] and finite. An entry a sets a joint's
-        target, which has limits lo and hi, to lo + (a + 1)/2 (hi - lo). Force and torque are in the world frame.
-        """
-        action = action.to(self._engine.ctrl.dtype)
-        share = action.shape[1] // len(SIDES)
-        for side, body in enumerate(self._bodies):
-            first = side * share
-            targets = self._engine.ctrl[:, side * self._joints : (side + 1) * self._joints]
-            torch.mul(action[:, first : first + self._joints], self._half, out=targets)
-            targets += self._middle
-            if self._moving:
-                self._engine.xfrc_applied[:, body] = action[:, first + self._joints : first + share] * self._wrench
 
 
 class Part:
@@ -96,7 +56,8 @@ class Part:
         """Size of a start position, which consists of ``qpos`` and the poses of movable fixtures."""
         for member in group.members:
             tasks = slots[member.slot].tasks
-            checked.formulas(member.scene, tasks, self._engine.sensordata, observed=rule != "masked")
+            check_formulas(member.scene, tasks, self._engine.sensordata)
+        self._goals = {m.slot: {b.name for b, _ in m.scene.task.layout if b.goal} for m in group.members}
         self._observer = Observer(group.members[0].scene, self._start_mounts(), width)
         if sights is not None:
             self._engine.body_poses()  # from this call on, the engine computes the poses
@@ -223,8 +184,7 @@ class Part:
         """
         sensors = self._engine.sensordata
         values = self._observer(sensors if rows is None else sensors[rows], action, rotation, out)
-        if self._rule != "masked":
-            self._show_goals(values, states, rows)
+        self._show_computed(values, states, rows, self._rule != "masked")
         self._observer.choose_signs(values)
         if self._sights is not None:
             position, rotation = self._engine.body_poses()
@@ -236,17 +196,30 @@ class Part:
                 self._sights[member.slot].show(values[where], position[own], rotation[own])
         return values.clamp_(-CLIP, CLIP)
 
-    def _show_goals(
-        self, values: Tensor, states: list[tuple[Member, slice, TaskState]], rows: Tensor | None = None
+    def _show_computed(
+        self,
+        values: Tensor,
+        states: list[tuple[Member, slice, TaskState]],
+        rows: Tensor | None = None,
+        goals: bool = True,
     ) -> None:
+        """Write the blocks that classes compute; without ``goals`` only those that show no goal.
+
+        The blocks that our own classes compute all show goals.
+        """
         for member, where, state in states:
-            blocks = member.scene.task.observe(state)
+            task = member.scene.task
+            if not goals and task.is_shipped:
+                continue
+            blocks = task.observe(state)
+            if not goals:
+                blocks = {name: block for name, block in blocks.items() if name not in self._goals[member.slot]}
             if self.looks:
                 if rows is None:
                     engine_rows = member.engine_rows
                 else:
                     engine_rows = rows[where]
-                checked.own_numbers(member.scene.task, "observe", blocks, self.unstable, engine_rows)
+                check_numbers(member.scene.task, "observe", blocks, self.unstable, engine_rows)
             for name, block in blocks.items():
                 values[where, self._observer.layout.range(name)] = block.float()
 
@@ -256,7 +229,7 @@ class Part:
         ``states`` are those of all engine rows, with the goals to show.
         """
         values = torch.zeros(self._engine.num, width, device=self._engine.device)
-        self._show_goals(values, states)
+        self._show_computed(values, states)
         self._observer.choose_signs(values)
         return values.clamp_(-CLIP, CLIP)
 
@@ -264,8 +237,8 @@ class Part:
         """Raise BidexError if a user's own class returns numbers that are not finite in the present state."""
         for member, _, state in self.states(task_index):
             task = member.scene.task
-            checked.own_numbers(task, "reward_terms", task.rewards(state), self.unstable, member.engine_rows)
-            checked.own_numbers(task, "observe", task.observe(state), self.unstable, member.engine_rows)
+            check_numbers(task, "reward_terms", task.rewards(state), self.unstable, member.engine_rows)
+            check_numbers(task, "observe", task.observe(state), self.unstable, member.engine_rows)
 
     def starts(self, rows: Tensor | None, draws: Tensor, task_index: Tensor, shares: Tensor | None = None) -> Tensor:
         """Return start positions of episodes, (n, start_size), as a pure function of the draws and the tasks.
@@ -295,7 +268,7 @@ class Part:
                 frozen = self.frozen(i, task_index[where])
             task.begin(own, frozen, views)
             if self.looks:
-                checked.own_numbers(task, "start", views)
+                check_numbers(task, "start", views)
         return qpos
 
 
@@ -380,7 +353,7 @@ def collect(parts: Sequence[Part], task_index: Tensor, action: Tensor, width: in
             env_ids = member.env_ids
             judged = judge(member.scene.task, state)
             if part.looks:
-                checked.own_numbers(member.scene.task, "reward_terms", judged.terms, part.unstable, member.engine_rows)
+                check_numbers(member.scene.task, "reward_terms", judged.terms, part.unstable, member.engine_rows)
             reward[env_ids] = judged.reward
             success[env_ids] = judged.success
             failed[env_ids] = judged.failed

@@ -89,7 +89,7 @@ class World(BatchedWorld):
         self.episodes_per_task = config.episodes_per_task
         self.endless = config.task_sampling == "fresh"
         draws = self.autoreset_mode != AutoresetMode.DISABLED
-        self.draws_tasks = draws and config.task_sampling != "fixed"
+        self.draws_tasks = config.task_sampling == "uniform" or (draws and config.task_sampling == "fresh")
         """True if environments draw their tasks; otherwise each of them keeps its task."""
         self._renews_tasks = draws and self.endless
         if self._renews_tasks:

@@ -114,6 +114,19 @@ def test_an_agent_with_the_calls_of_a_learner_shares_what_it_finds() -> None:
     assert list(alone.splits) == ["train"] and list(alone.splits["train"].after.classes) == list(COUNTS["train"])
 
 
+class Ending(Constant):
+    """Tries to end every episode."""
+
+    def observe(self, timestep) -> None:
+        for told in (timestep.truncated, timestep.terminated, timestep.valid):
+            told.fill_(True)
+
+
+def test_an_agent_cannot_end_episodes() -> None:
+    ending, other = (meta_test(agent, "ML4", **SMALL).to_json()["splits"] for agent in (Ending(), Constant()))
+    assert ending == other
+
+
 class Drawing(Finder):
     """Draws its exploring actions from one generator, which ``init`` does not restart."""
 
@@ -141,6 +154,9 @@ def test_the_file_is_read_again_and_is_no_run_s(tmp_path: Path, adapted: Path, r
     assert (stored["agent"], stored["suite"], stored["task_seed"], "run" in stored) == ("Scout", "ML4", 3, False)
     assert stored["conditions"]["suite_digest"] == load_suite("ML4").digest
     assert "got that of the agent Scout" in refused("verify", adapted, "--evaluation", path)
+    for given in ({"suite": "ML4"}, {"task_seed": 1}):
+        with pytest.raises(BidexError, match=f"{next(iter(given))}: a run has its own, got .* Leave"):
+            meta_test(adapted, **given)
 
 
 @pytest.mark.parametrize(
@@ -153,8 +169,7 @@ def test_the_file_is_read_again_and_is_no_run_s(tmp_path: Path, adapted: Path, r
         (Constant(), "ML4", {"save": True}, r"call result\.save\(path\)"),
         (Wide(), "ML4", {}, "Expected actions of shape"),
         (Locked(), "ML4", {}, "copy.deepcopy can copy, got a Locked: .*lock"),
-        ("runs/r", "ML4", {}, "suite: a run has its own, got ML4. Leave suite out"),
-        ("runs/r", None, {"task_seed": 1}, "task_seed: a run has its own"),
+        ("runs/r", "ML4", {}, "runs/r is not a run folder"),
     ],
 )
 def test_refusals_are_one_line(agent, suite, options, expected) -> None:

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from bidex_meta.benchmark import make_task_world
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import filming
 from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
@@ -120,6 +121,9 @@ def test_random_agent_is_uniform_and_ignores_torchs_global_generator():
 
 
 def test_refusals_name_the_mend():
+    drawing = make_task_world("Switch-v2", 4, "cpu", threads=1, autoreset_mode="DISABLED", task_sampling="uniform")
+    with pytest.raises(BidexError, match='task_sampling="fixed"'):
+        evaluate(Seeker(), drawing, 1)
     with pytest.raises(BidexError, match="DISABLED"):
         evaluate(Seeker(), ToyWorld(6, "SAME_STEP"), 1)
     with pytest.raises(BidexError, match="num_envs=6"):

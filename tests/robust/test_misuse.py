@@ -46,10 +46,10 @@ from bidex_meta.runs import (
     training_seconds,
 )
 from bidex_meta.suite_files import load_randomisation, metaworld_classes
-from bidex_meta.tasks.base import Solver
 from bidex_meta.tasks.layout import Block, Layout, goal_blocks, object_blocks
 from bidex_meta.tasks.placement import placed
 from bidex_meta.tasks.scene import SceneObject
+from bidex_meta.tasks.solver import Solver
 from bidex_meta.tasks.variation import VariationSpace, box, component, join, orientation
 from bidex_meta.world import PointsRule, Slot, World, WorldConfig
 from bidex_meta.world.wrapper import NumpyWorld, PooledWorldWrapper, WorldWrapper

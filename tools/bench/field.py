@@ -15,8 +15,8 @@ from gymnasium.vector import VectorEnv
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.metaworld.batched import MetaWorldWorld
+from bidex_meta.rules import CONTROL_RATE
 from bidex_meta.runs.atomic import Json
-from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.utils.memory import usable_cores
 
 _METAWORLD_ROWS = 10
