@@ -83,8 +83,8 @@ class TrialAgent(Protocol):
     trials of other tasks; the size of its mask is N. Then each step calls ``act`` and ``observe``. The next episode of
     a trial begins without a call, after ``terminated`` or ``truncated``. If ``valid`` is False, learn nothing from the
     environment: its episode is over and the environment waits for the others, or its physics broke. Broken physics ends
-    the episode too: ``truncated`` is then true although ``valid`` is False. Tensors are on the device of the
-    world.
+    the episode too: ``truncated`` is then true although ``valid`` is False. One of the two flags is true once per
+    episode. Tensors are on the device of the world.
 
     ``copy.deepcopy`` must copy what the agent has learned: copies act in the evaluation episodes, and the agent itself
     learns only from exploring episodes.

@@ -217,8 +217,8 @@ def _explore(agent: MetaLearningAgent, world: TaskWorld, obs: Tensor, playing: T
         valid = running & ~info["unstable"]
         # The world continues with environments whose episodes were cut here; they are ignored until their next reset.
         truncated = truncated | ((limit <= step) & ~terminated)
-        # The agent gets copies: it must not be able to end episodes.
-        told = terminated.clone(), truncated.clone()
+        # The agent gets copies, because it must not be able to end episodes. Each episode is told to end once.
+        told = terminated & running, truncated & running
         agent.step(Timestep(obs, action, reward, *told, outputs, new, valid.clone()))
         steps += valid.sum()
         running = running & ~(terminated | truncated)

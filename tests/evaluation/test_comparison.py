@@ -146,7 +146,7 @@ def test_the_command_prints_tables_and_json(tmp_path: Path, capsys: pytest.Captu
     ]
     assert main(["compare", *paths]) == 0
     out = capsys.readouterr().out
-    assert "mttrpo" in out and "50.0 to 50.0" in out and "is no difference" in out
+    assert "mttrpo" in out and "50.0 to 50.0" in out and "shows no difference" in out
     assert main(["compare", *paths, "--json"]) == 0
     first, second = json.loads(capsys.readouterr().out)
     assert first["success_over_first"] is None and second["success_over_first"]["value"] == 0.0
