@@ -89,7 +89,7 @@ def rules_apart(others: Mapping[str, object], rules: Rules) -> str:
 
 
 _Factor = Annotated[float, Meta(ge=0.01, le=100.0)]
-_Size = Annotated[float, Meta(ge=0.8, le=1.25)]
+_Size = Annotated[float, Meta(ge=0.9, le=1.1)]  # the success of StackBlock and PourWater assumes sizes near 1
 _Steps = Annotated[int, Meta(ge=0, le=60)]
 _Range = tuple[_Factor, _Factor]
 
@@ -106,7 +106,8 @@ class Randomisation:
     """Factor of the friction of all contacts."""
     object_mass: _Range = (1.0, 1.0)
     object_size: tuple[_Size, _Size] = (1.0, 1.0)
-    """Factor of the lengths of free objects without joints; their masses do not change."""
+    """Factor of the lengths of free objects without joints; their masses do not change. Not with point clouds,
+    pictures or ``--object``."""
     actuator_gain: _Range = (1.0, 1.0)
     """Factor of the fingers' actuator forces, before their limits."""
     joint_damping: _Range = (1.0, 1.0)

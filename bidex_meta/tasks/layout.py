@@ -25,6 +25,10 @@ _POSE = "position (m) and quaternion (x, y, z, w), world frame"
 _DIFFERENCE = "object times inverse goal quaternion, (x, y, z, w)"
 
 
+GOAL_QUATERNIONS = ("_pose", "_rotation_difference")
+"""Ends of the names of goal blocks whose last four entries are a quaternion (:func:`goal_blocks`)."""
+
+
 @checked_arguments
 @dataclass(frozen=True)
 class Block:

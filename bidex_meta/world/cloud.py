@@ -37,6 +37,8 @@ class Camera:
         forward = np.subtract(self.target, self.eye)
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, (0.0, 0.0, 1.0))
+        if np.linalg.norm(right) < 1e-6:
+            right = np.array((1.0, 0.0, 0.0))  # the camera looks straight up or down
         right /= np.linalg.norm(right)
         return np.stack((right, np.cross(forward, right), forward))
 

@@ -65,6 +65,11 @@ def exponents(scene: Scene, varied: Sequence[str], device: torch.device) -> Expo
     for factor, name, exponent in _laws(scene.model):
         if factor in varied:
             found.setdefault(name, {})[factor] = torch.tensor(exponent, dtype=torch.float64, device=device)
+    if "object_size" in varied and getattr(scene.task, "held", None) is not None:
+        raise BidexError(
+            f"randomisation: object_size: expected the egg, got {scene.task.name} with another object. Its "
+            "height depends on how it lies. Leave object_size out."
+        )
     if "object_size" in varied and (scene.model.geom_type[_free(scene.model)[scene.model.geom_bodyid]] == _MESH).any():
         raise BidexError(
             f"randomisation: object_size: expected simple shapes, got a mesh in {scene.task.name}. Leave it out."

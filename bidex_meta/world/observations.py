@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.hand import SIDES, hand
-from bidex_meta.tasks.layout import Layout, both_hands
+from bidex_meta.tasks.layout import GOAL_QUATERNIONS, Layout, both_hands
 from bidex_meta.tasks.scene import Scene
 from bidex_meta.utils.maths import conjugate, xyzw
 from bidex_meta.world.contract import ObservationGroup
@@ -89,7 +89,7 @@ class Observer:
         for block, where in self.layout:
             if block.name in _HAND_OF:
                 continue
-            if block.goal:
+            if block.goal and block.name.endswith(GOAL_QUATERNIONS):
                 found += [where.stop - 4]
             at = where.start
             for name in block.sensors:

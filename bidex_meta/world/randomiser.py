@@ -8,9 +8,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from bidex_meta.hands.hand import SIDES
+from bidex_meta.hands.hand import SIDES, hand
 from bidex_meta.rules import CONTROL_RATE, FACTORS, Randomisation
-from bidex_meta.tasks.layout import CLIP, Layout
+from bidex_meta.tasks.layout import CLIP
+from bidex_meta.tasks.scene import Scene
+from bidex_meta.world.depth_sensor import privileged_columns
 from bidex_meta.world.model_factors import exponents, heights, object_bodies
 from bidex_meta.world.part import Part
 from bidex_meta.world.random import derived, normal, uniform
@@ -176,6 +178,8 @@ class _Models:
         acceleration = self._part.group.take(acceleration)
         masses = self._fields.get("body_mass")
         for member, first, nominal in zip(self._part.group.members, self._first, self._masses, strict=True):
+            if not first:
+                continue  # there is no object
             rows = member.engine_rows
             force = self._part.group.engine.xfrc_applied
             if masses is None:
@@ -185,15 +189,24 @@ class _Models:
             force[rows, first:, :3] = (acceleration[rows, None] * mass).to(force.dtype)
 
 
-def deviations(rule: Randomisation, layouts: Sequence[Layout], hidden: Sequence[Sequence[int]]) -> Tensor:
+def deviations(rule: Randomisation, scenes: Sequence[Scene], hidden: Sequence[Sequence[int]], goals: bool) -> Tensor:
     """Return the standard deviation of the noise in each slot's observations, (slots, columns), float32.
 
-    Goals, actions and the columns that a point cloud replaces have no noise. ``hidden`` lists these columns per slot.
+    Actions, goals, forces of joints without actuators, which are always 0, and the columns that a point cloud replaces
+    (``hidden``, per slot) have no noise. Entries of a goal
+    that depend on an object, such as the rotation between both, have noise, because they would show the object without
+    it. ``goals`` says whether observations show goals.
     """
-    table = torch.zeros(len(layouts), max(layout.size for layout in layouts))
-    for row, layout, zero in zip(table, layouts, hidden, strict=True):
+    table = torch.zeros(len(scenes), max(scene.task.layout.size for scene in scenes))
+    for row, scene, zero in zip(table, scenes, hidden, strict=True):
+        layout = scene.task.layout
         for block, where in layout:
             if not block.goal and block.name not in {f"{side}_action" for side in SIDES}:
                 row[where] = rule.observation_noise
+            if block.name.endswith("_joint_force"):
+                passive = set(range(len(hand().joints))) - set(hand().actuated.tolist())
+                row[[where.start + joint for joint in passive]] = 0.0
+        if goals:
+            row[privileged_columns(scene)] = rule.observation_noise
         row[list(zero)] = 0.0
     return table

@@ -165,11 +165,18 @@ class World(BatchedWorld):
         self._set_spaces(Box(-CLIP, CLIP, (size,), np.float32), actions)
 
     def _randomised(self, rule: Randomisation) -> Randomiser:
+        if rule.object_size != (1.0, 1.0) and (self.points or self._config.pixels):
+            raise BidexError(
+                "randomisation: object_size: expected neither points nor pixels, because they show objects of their "
+                "usual size. Leave one of them out."
+            )
         if self._sights:
             hidden = [sight.hidden for sight in self._sights]
         else:
             hidden = [()] * self.num_tasks
-        table = deviations(rule, [slot.task_class.layout for slot in self.slots], hidden).to(self.device)
+        scenes = {member.slot: member.scene for part in self.parts for member in part.group.members}
+        in_order = [scenes[slot] for slot in range(self.num_tasks)]
+        table = deviations(rule, in_order, hidden, not self.hides_goals).to(self.device)
         return Randomiser(rule, self.parts, self.action_size, table[self.task_id])
 
     def _renew_draws(self) -> None:
@@ -376,6 +383,7 @@ class World(BatchedWorld):
     def load_state_dict(self, state: State) -> None:
         """Restore a ``state_dict``; raises BidexError for the state of a world that was made differently."""
         self._set_pools(checked.state(state, self.state_dict(), self.slots, self.task_id))
+        self.pictures = None  # those of the former state
         # An evaluation world may continue the episodes of a training world.
         self._renews_tasks = state.get("renews_tasks", False) and self.autoreset_mode != AutoresetMode.DISABLED
         self._restore(state)

@@ -280,6 +280,12 @@ def test_each_class_has_networks_of_its_own_and_is_told_by_what_is_seen(monkeypa
     assert learner.shape.classes == 2 and 0.6 < learner.iterate()["Loss/class"] < 0.8  # log 2: they look alike
 
 
+def test_metrics_of_training_count_no_episodes_of_teachers() -> None:
+    metrics = taught(PointGoals(16, classes=TEN), replace(SMALL, teacher_steps=10**9)).iterate()
+    assert metrics["Policy/teacher_share"] == 1.0
+    assert not [name for name in metrics if name.startswith(("Train/return", "Train/success", "Train/mean"))]
+
+
 def test_it_learns_from_nobody_until_it_has_teachers() -> None:
     with pytest.raises(BidexError, match="no teachers to learn from"):
         ICL(PointGoals(8), SMALL, seed=0)

@@ -149,3 +149,13 @@ def test_a_shape_is_kept_in_a_checkpoint() -> None:
     shape = Shape(9, 2, SCATTERED.groups)
     assert Shape.load(shape.state_dict()) == shape and shape.num_id_columns == 2
     assert Shape.of(opposite_bandits()) == Shape(3, 2, plain_groups(3, 2))
+
+
+def test_a_column_that_was_constant_is_not_amplified() -> None:
+    """Padding in training may be another object of an unseen class."""
+    normaliser, obs = ObservationNormaliser(3), torch.randn(50, 3, generator=generator())
+    obs[:, 1] = 0.0
+    obs[:, 2] = 0.3
+    normaliser.update(obs)
+    seen = normaliser(torch.tensor([[0.0, 0.7, 0.5]]))
+    assert_close(seen[0, 1:], torch.tensor([0.7, 0.2]))

@@ -364,7 +364,7 @@ CALLS: dict[str, Callable[[Shop], Call]] = {
     "VariationSpace.contains": lambda s: (s.space.contains, {"vector": (s.pool[0], " ".join(HOSTILE))}),
     "Block": lambda s: (Block, {
         "name": ("a", "word"), "size": (3, "one"), "sensors": (("a",), ""), "scale": (1.0, NUMBERS + " huge"),
-        "goal": (False, "true"), "saturates": (False, "true"), "description": ("", "empty word"),
+        "goal": (False, ""), "saturates": (False, "true"), "description": ("", "empty word"),
     }),
     "Layout": lambda s: (Layout, {"blocks": (object_blocks("block"), "")}),
     "Layout.range": lambda s: (s.layout.range, {"name": ("block_pose", "")}),

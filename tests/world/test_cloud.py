@@ -158,3 +158,9 @@ def test_from_the_side_it_looks_at_the_same_place_from_as_far() -> None:
     assert side.target == _CAMERA.target
     assert abs(float(np.linalg.norm(np.subtract(side.eye, side.target))) - 1.0) < 0.01
     assert abs(side.axes[2] @ _CAMERA.axes[2]) < 0.01
+
+
+def test_a_camera_may_look_straight_down() -> None:
+    axes = Camera((0.0, -0.6, 1.8), (0.0, -0.6, 0.5)).axes
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(axes[2], (0.0, 0.0, -1.0))

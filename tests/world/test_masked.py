@@ -67,7 +67,7 @@ def no_looks(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         original = getattr(owner, name)
 
         def method(*args: Any, **kwargs: Any) -> Any:
-            if not _at_work:
+            if not _at_work and not (name == "as_tensor" and isinstance(args[0], Tensor)):
                 raise AssertionError(f"A step calls {name}.")
             return original(*args, **kwargs)
 

@@ -18,7 +18,7 @@ from bidex_algos.meta.icl_config import PRESETS, ICLConfig
 from bidex_algos.meta.memory_agent import MemoryAgent
 from bidex_algos.meta.taught_trials import Steps, TaughtTrials
 from bidex_algos.meta.trial_learner import TrialLearner
-from bidex_algos.meta.trials import Trials
+from bidex_algos.meta.trials import Player, Trials
 from bidex_algos.nets.borrowed import BorrowedPolicy
 from bidex_algos.nets.evidence import Belief, BeliefNet, BeliefPolicy
 from bidex_algos.nets.inputs import Inputs
@@ -305,7 +305,7 @@ class ICL(TrialLearner):
             self.data.load_state_dict(state["data"])
 
 
-class _Pupil:
+class _Pupil(Player):
     """Chooses the actions in a trial: teachers act in some environments, and the policy acts in the others.
 
     All steps are labelled by the teachers. In a fraction ``still_share`` of the episodes the policy does not explore,
@@ -332,6 +332,10 @@ class _Pupil:
         learner.teachers.reset(torch.ones_like(shown))
         if self._tried is None and learner.teachers.privileged is not None:
             self._draw_goals(learner.teachers.privileged)
+
+    def plays(self) -> Tensor:
+        """Return in which environments the policy acts, bool (N,), and not the teacher."""
+        return ~self._data.taught
 
     def _draw(self, draw: Callable[..., Tensor], *columns: int) -> Tensor:
         return draw(len(self._rows), *columns, generator=self._learner.generator, device=self._learner.device)

@@ -102,6 +102,10 @@ class Player(Protocol):
         """
         ...
 
+    def plays(self) -> Tensor | bool:
+        """Return in which environments the policy acts, bool (N,); True for all. Other episodes are not counted."""
+        return True
+
     def earned(self, reward: Tensor, valid: Tensor, slot: Tensor) -> None:
         """Record the step's rewards (N,).
 
@@ -109,7 +113,7 @@ class Player(Protocol):
         """
 
 
-class Sampling:
+class Sampling(Player):
     """Samples actions from the policy's Gaussian."""
 
     def __init__(self, policy: RecurrentPolicy, generator: torch.Generator):
@@ -183,7 +187,7 @@ def play(
                 break
         found = {"r": earned, "l": elapsed, "success": success}
         for each in statistics[episode]:
-            each.update({"running": found, "episode_mask": whole})
+            each.update({"running": found, "episode_mask": whole & player.plays()})
     trials.obs[trials.lengths, rows] = obs
 
 

@@ -30,7 +30,7 @@ def cumulated(shares: Tensor) -> Tensor:
 
     In deterministic mode torch refuses ``cumsum`` of floats on a GPU, where the sums are therefore a product.
     """
-    if shares.device.type == "cpu":
+    if maths.may_look(shares.device):  # on a CPU
         return shares.cumsum(-1)
     return (shares.double() @ _ones_above(shares.shape[-1], shares.device)).to(shares.dtype)
 

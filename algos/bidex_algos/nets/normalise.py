@@ -10,6 +10,7 @@ from bidex_meta.training.distributed import pool_moments
 from bidex_meta.training.learner import LearnerConfig
 
 _FLOOR = 3e-3  # least standard deviation, so that a column that was constant so far does not amplify noise too much
+_CONSTANT = 1e-6  # a column with a smaller standard deviation is constant except for rounding
 _FOREVER = 1e18  # a count so large that further observations have no weight
 
 
@@ -118,7 +119,9 @@ class ObservationNormaliser(nn.Module):
             return
         self.stats.merge(*pool_moments(mean, var, count))
         self.measured.write(self.shift, self.stats.mean.float())
-        self.measured.write(self.scale, self.stats.std(_FLOOR).reciprocal().float())
+        # A column that was constant in training, such as padding, is not amplified if it varies in an unseen class.
+        scale = torch.where(self.stats.var < _CONSTANT**2, 1.0, self.stats.std(_FLOOR).reciprocal())
+        self.measured.write(self.scale, scale.float())
 
 
 def observation_normaliser(config: LearnerConfig, inputs: Inputs, tasks: int) -> ObservationNormaliser:

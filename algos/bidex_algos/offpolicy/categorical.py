@@ -131,9 +131,10 @@ RECENT = 0.9  # decay per step of the mean of recent rewards, so that about the 
 class ReturnBound(ReturnScale):
     """Statistics of returns that also hold the largest absolute return of each task.
 
-    The largest return is needed because rewards are scaled so that all returns lie within the atoms. A sum discounts
-    earlier rewards instead of later ones, because the end of the episode is not known yet. The sum of the discount
-    factors over successive rewards is the same in both directions. At a time limit the episode is assumed to continue
+    The largest return is needed because rewards are scaled so that returns lie within the atoms. A sum discounts
+    earlier rewards instead of later ones, because the end of the episode is not known yet. With constant rewards the
+    sums are the same in both directions. If an episode has large rewards at its start, its return may be up to twice
+    the bound, and then saturates at the last atom. At a time limit the episode is assumed to continue
     with its mean reward, or with the mean of its most recent rewards if that is larger. ``mass`` (N,) is the sum that
     would result if all rewards had been 1. ``recent`` (2, N) holds two sums with a discount of at most :data:`RECENT`:
     the sum of the rewards, and the sum that would result if all rewards had been 1.
