@@ -106,7 +106,7 @@ def trained(path: Path, threads: int, *options: str, stop: int | None = None) ->
     if stop is not None:
         torch.set_num_threads(1)  # whatever the machine, the run keeps its threads
         assert main(["run", "--resume", str(path), "--steps", str(4 * ITERATION), "--no-evaluate"]) == 0
-        assert torch.get_num_threads() == threads
+        assert RunFolder.open(path).config().threads == threads
     return final(path)[0], metrics(path)
 
 

@@ -7,6 +7,7 @@ An observation is made in these steps: ``Part.advance`` (engine) -> ``sensordata
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from functools import cached_property, partial
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -174,9 +175,9 @@ class World(BatchedWorld):
             hidden = [sight.hidden for sight in self._sights]
         else:
             hidden = [()] * self.num_tasks
-        scenes = {member.slot: member.scene for part in self.parts for member in part.group.members}
-        in_order = [scenes[slot] for slot in range(self.num_tasks)]
-        table = deviations(rule, in_order, hidden, not self.hides_goals).to(self.device)
+        members = chain.from_iterable(part.group.members for part in self.parts)
+        scenes = [member.scene for member in sorted(members, key=lambda member: member.slot)]
+        table = deviations(rule, scenes, hidden, not self.hides_goals).to(self.device)
         return Randomiser(rule, self.parts, self.action_size, table[self.task_id])
 
     def _renew_draws(self) -> None:

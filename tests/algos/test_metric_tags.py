@@ -28,7 +28,8 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
     "maml": [{}, {"outer": "adam"}, {"step_sizes": "weight"}], "promp": [{}, {"step_sizes": "layer"}], "mttrpo": [{}],
     **{name: [{}] for name in ("mtsac", "mttd3", "fasttd3", "brc", "flashsac", "ddpg", "rl2", "varibad")},
     **{name: [{}] for name in ("bc", "bcq", "td3bc", "iql")},
-    "pearl": [{"steps_per_iteration": 25}], "dagger": [{"teacher_steps": 0}], "icl": [{"trials": 32, "memory": 8}],
+    "pearl": [{"steps_per_iteration": 25}], "dagger": [{"teacher_steps": 0}],
+    "icl": [{"trials": 32, "memory": 8, "teacher_steps": 0}],
 }  # fmt: skip
 PLAYING = [algo for algo in VARIANTS if Capability.OFFLINE not in learner_kind(algo).make.capabilities]
 TEAM = {"agents": "a=action/0;b=action/1"}

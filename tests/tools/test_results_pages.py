@@ -81,7 +81,7 @@ def test_arms_are_in_the_order_of_the_success_that_the_table_shows() -> None:
 
 
 def test_a_mean_over_fewer_classes_says_how_many(tmp_path: Path) -> None:
-    shares = {"hidden": [], "blind": 0.25, "chance": 0.02, "named": 0.1}
+    shares = {"hidden": [], "blind": 0.25, "chance": 0.02, "named": 0.1, "explained": 0.0}
     known = {**shares, "solved": 0.5, "alignment": {"rank": 0.75, "solved": 2.0, "unsolved": 1.0}}
     (tmp_path / "validity").mkdir()
     rows = {"A": known, "B": {**shares, "blind": 0.75, "alignment": None}}
@@ -154,7 +154,8 @@ def test_pictures_are_drawn_anew_where_the_data_changed(page: Path) -> None:
     page.write_text("".join(f"<!-- results: study=tiny show={s} -->\n<!-- end -->\n" for s in ("curves", "classes")))  # fmt: skip  # noqa: E501
     written = fill(page, data(page))
     assert [path.name for path in written] == ["tiny-curves.png", "page.md"]
-    assert "![Return and success over training: tiny, MT4](tiny-curves.png)" in page.read_text()
+    title = "Return and success of training episodes, which have exploration noise"
+    assert f"![{title}: tiny, MT4](tiny-curves.png)" in page.read_text()
     assert "55 % (50 to 60)" in page.read_text()
     assert fill(page, data(page), check=True) == []
     changed = data(page) / "tiny.json"
