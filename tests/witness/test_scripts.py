@@ -6,9 +6,8 @@ import torch
 
 from bidex_meta.benchmark import make_task_world
 from bidex_meta.errors import BidexError
-from bidex_meta.rules import V2
+from bidex_meta.rules import CONTROL_RATE, V2
 from bidex_meta.tasks.articulated import Switch
-from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.catches import HandOver
 from bidex_meta.tasks.cubes import StackBlock
 from bidex_meta.tasks.vessels import LiftUnderarm
