@@ -1,10 +1,10 @@
 """Probes that guess a task from the first observations of its episodes.
 
 A learner that can name the task from its first observation may learn the train tasks by heart instead of adapting (Yin
-et al. 2020, arXiv 1912.03820). There are three probes. The nearest neighbour among other episodes names the task; so
-does a ridge regression of the tasks' labels. A ridge regression of the hidden values predicts these, and names the task
-that is nearest to its prediction. If observations do not reveal the task, no probe does better than chance. If they
-show the goal, the last probe finds it, also where fifty tasks lie along one number, which labels cannot separate.
+et al. 2020, arXiv 1912.03820). There are four probes. The nearest neighbour among other episodes and a ridge regression
+on other episodes guess the task, or the hidden values and with them the task that is nearest. If observations do not
+reveal the task, no probe does better than chance. If they show the goal, the regression of hidden values finds the task
+even where fifty tasks lie along one number, which a regression of labels cannot separate.
 """
 
 import math

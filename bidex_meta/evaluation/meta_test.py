@@ -217,9 +217,9 @@ def _explore(agent: MetaLearningAgent, world: TaskWorld, obs: Tensor, playing: T
         valid = running & ~info["unstable"]
         # The world continues with environments whose episodes were cut here; they are ignored until their next reset.
         truncated = truncated | ((limit <= step) & ~terminated)
-        # The agent gets copies, because it must not be able to end episodes. Each episode is told to end once.
-        told = terminated & running, truncated & running
-        agent.step(Timestep(obs, action, reward, *told, outputs, new, valid.clone()))
+        # The agent gets copies, because it must not be able to end episodes. It sees each episode end once.
+        ends = (terminated & running, truncated & running)
+        agent.step(Timestep(obs, action, reward, *ends, outputs, new, valid.clone()))
         steps += valid.sum()
         running = running & ~(terminated | truncated)
         obs = new

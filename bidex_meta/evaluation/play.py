@@ -180,7 +180,7 @@ def agent_step(
         new, reward, terminated, truncated, info = outcome
         valid = running & ~info["unstable"]
         action = torch.as_tensor(action, device=obs.device)
-        # The agent gets copies, because it must not be able to end episodes. Each episode is told to end once.
+        # The agent gets copies, because it must not be able to end episodes. It sees each episode end once.
         observe(Timestep(obs, action, reward, terminated & running, truncated & running, {}, new, valid))
     return outcome
 

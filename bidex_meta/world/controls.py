@@ -1,4 +1,4 @@
-"""How actions become controls of the hands."""
+"""Conversion of actions to controls of the hands."""
 
 import torch
 from torch import Tensor

@@ -118,8 +118,8 @@ class Ending(Constant):
     """Tries to end every episode."""
 
     def observe(self, timestep) -> None:
-        for told in (timestep.truncated, timestep.terminated, timestep.valid):
-            told.fill_(True)
+        for flags in (timestep.truncated, timestep.terminated, timestep.valid):
+            flags.fill_(True)
 
 
 def test_an_agent_cannot_end_episodes() -> None:

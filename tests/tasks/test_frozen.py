@@ -1,4 +1,4 @@
-"""What an episode draws decides its start: rewards, success and failure do not read it (version 2)."""
+"""Values that an episode of version 2 draws only affect its start, not rewards, success and failure."""
 
 from dataclasses import replace
 from typing import Literal
