@@ -167,14 +167,19 @@ def draw(seed: int, tasks: int, entries: int = 5) -> torch.Tensor:
 
 
 @settings(max_examples=60, deadline=None)
-@given(seeds, st.integers(2, 20), st.integers(1, 30), st.integers(1, 30), st.floats(-4, 0), st.floats(0.05, 0.95))
-@example(296, 16, 17, 6, -1.16, 0.87)  # a descent along pairs of weights ended 0.4 below, in squares of the mean
+@given(
+    seeds, st.integers(2, 20), st.integers(1, 30), st.integers(1, 30), st.floats(-4, 0), st.floats(0.05, 0.95),
+    st.sampled_from([1.0, 0.1, 0.01]),
+)  # fmt: skip
+@example(296, 16, 17, 6, -1.16, 0.87, 1.0)  # a descent along pairs of weights ended 0.4 below, in squares of the mean
+@example(4, 12, 30, 30, -1.0, 0.4, 0.01)  # 24 halvings of the barrier ended 20 below
 def test_no_direction_serves_the_worst_served_task_better_than_cagrads(
-    seed: int, tasks: int, entries: int, rank: int, apart: float, c: float
+    seed: int, tasks: int, entries: int, rank: int, apart: float, c: float, left: float
 ):
-    # The matrices have low rank or are nearly parallel, and sizes differ tenfold.
+    # The matrices have low rank or are nearly parallel, and sizes differ tenfold. ``left`` is what is left of the mean.
     gradients = draw(seed, 1, entries) * (apart < -2) + 10**apart * draw(seed, tasks, rank) @ draw(seed, rank, entries)
     gradients *= torch.logspace(0, 1, tasks, dtype=torch.float64)[:, None]
+    gradients -= (1 - left) * gradients.mean(0)
     gram, even = gradients @ gradients.T, torch.full((tasks,), 1 / tasks, dtype=torch.float64)
     length = gradients.mean(0).norm()
     direction = conflict_averse(gradients, c)[0] / tasks
