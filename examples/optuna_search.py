@@ -10,7 +10,7 @@ from pathlib import Path
 import optuna
 import tyro
 
-from bidex_meta import BidexError, RunConfig, evaluate, train
+from bidex_meta import RunConfig, evaluate, train
 
 
 def main(
@@ -28,7 +28,7 @@ def main(
         algo: A learner (`bidex-meta list algos`).
         steps: Environment steps of each run.
         trials: Runs to make.
-        seed: Of the search; runs have seed 0.
+        seed: Of the search. Runs have the benchmark seed 1000; report results on other seeds.
         out: Where the runs and the study go.
     """
 
@@ -38,23 +38,25 @@ def main(
             "gamma": 1 - trial.suggest_float("one_minus_gamma", 0.01, 0.2, log=True),
             "epochs": trial.suggest_int("epochs", 2, 8),
         }
-        config = RunConfig(suite=suite, algo=algo, steps=steps, learner=settings, threads=1, logger="none")
+        config = RunConfig(suite=suite, algo=algo, steps=steps, seed=1000, learner=settings, threads=1, logger="none")
         try:
-            run = train(config, run_dir=out / str(trial.number))
-        except (BidexError, FloatingPointError) as error:
+            run = train(config, run_dir=runs / str(trial.number))
+        except FloatingPointError as error:  # training diverged
             raise optuna.TrialPruned(str(error)) from None
         return evaluate(run, save=True).success
 
-    out.mkdir(parents=True, exist_ok=True)
+    runs = out / f"{suite}-{algo}-{steps}"
+    runs.mkdir(parents=True, exist_ok=True)
     study = optuna.create_study(
         direction="maximize",
         study_name=f"{suite} {algo} {steps}",
         storage=f"sqlite:///{out / 'optuna.db'}",
-        sampler=optuna.samplers.TPESampler(seed=seed),
         load_if_exists=True,
     )
+    # Another start needs another seed, or it would repeat the random trials of the first.
+    study.sampler = optuna.samplers.TPESampler(seed=seed + 1000 * len(study.trials))
     study.optimize(success, n_trials=trials)
-    print(f"best: {study.best_value:.1%} by {study.best_params}, {out / str(study.best_trial.number)}")
+    print(f"best: {study.best_value:.1%} by {study.best_params}, {runs / str(study.best_trial.number)}")
     return study
 
 

@@ -8,6 +8,7 @@ import torch
 import tyro
 from torch import Tensor
 
+import tools
 from bidex_algos.meta.icl import ICL
 from bidex_algos.nets.evidence import Belief, spread
 from bidex_meta.agents import Agent
@@ -15,7 +16,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.eval_protocol import Protocol
 from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.experiments.metatest import Adaptation
-from bidex_meta.experiments.policies import checkpoint, fitting
+from bidex_meta.experiments.policies import fitting, load_checkpoint
 from bidex_meta.experiments.run_teachers import teachers_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.suite import OTHERS
@@ -56,7 +57,7 @@ def beliefs(
     found = dict[str, dict[str, list[float]]]()
     longest = Adaptation.of(worlds, folder.config()).max_adapt_steps
 
-    state = checkpoint(folder)[0]["learner"]["policy"]
+    state = load_checkpoint(folder)[0]["learner"]["policy"]
 
     def believing(belief: Belief) -> Agent:
         with fitting(folder.path):
@@ -117,4 +118,4 @@ class _ShownGoal:
 
 
 if __name__ == "__main__":
-    tyro.cli(beliefs)
+    tools.run(beliefs)

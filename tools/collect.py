@@ -15,6 +15,7 @@ from typing import Any
 import tyro
 from torch import nn
 
+import tools
 from bidex_meta.config import config_of
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments.policies import load_policy
@@ -259,4 +260,4 @@ def _rounded(value: Any, digits: int) -> Any:
 
 
 if __name__ == "__main__":
-    tyro.cli(collect)
+    tools.run(collect)

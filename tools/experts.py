@@ -6,6 +6,7 @@ from pathlib import Path
 
 import tyro
 
+import tools
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.references import Kind, load, store
 from bidex_meta.rules import V1
@@ -32,8 +33,14 @@ def experts(runs: tyro.conf.Positional[tuple[Path, ...]], suite: str = "MT20", o
             compare them with the policies found here.
         suite: Suite whose train classes are looked up.
         out: File of references, which is overwritten.
+
+    Raises:
+        BidexError: The suite is not of version 1, or a run cannot be compared (see :func:`best_known`).
     """
-    known = best_known(open_worlds({"suite": suite}).task_classes(), runs)
+    worlds = open_worlds({"suite": suite})
+    if worlds.rules != V1:
+        raise BidexError(f"Expected a suite of version 1, got {suite}. Scores of version 2 need no experts.")
+    known = best_known(worlds.task_classes(), runs)
     for name, row in known.items():
         print(f"{name}: {row['return']:.4g} ({row['source']})")
     if out is not None:
@@ -92,4 +99,4 @@ def _of_run(run: Run) -> list[tuple[str, Json]]:
 
 
 if __name__ == "__main__":
-    tyro.cli(experts)
+    tools.run(experts)

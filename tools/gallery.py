@@ -6,10 +6,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
-import tyro
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
+import tools
 from bidex_meta.benchmark import make_task_world
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import references
@@ -218,4 +218,4 @@ class _Comparisons(TorchFunctionMode):
 
 
 if __name__ == "__main__":
-    tyro.cli(gallery)
+    tools.run(gallery)

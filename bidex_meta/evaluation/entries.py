@@ -27,7 +27,7 @@ _FIRST_SEED = 2**30
 _TASKS_OF_METAWORLD = 50
 _MOST_EPISODES = 1000  # of a task after a shot, over all trials
 _ITEMS = {MULTI_TASK: 1, TRANSFER: 2}  # of ``shots`` by track; other tracks have one before and one after each shot
-_Name = Annotated[str, Meta(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f|]*$")]
+_Name = Annotated[str, Meta(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f|<>\[\]]*$")]
 _Digest = Annotated[str, Meta(pattern=r"^[0-9a-f]{32}$")]
 _Commit = Annotated[str, Meta(pattern=r"^[0-9a-f]{7,40}\+?$")]
 _Identity = Annotated[str, Meta(pattern=r"^[0-9a-f]{12}$")]

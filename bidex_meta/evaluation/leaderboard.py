@@ -53,7 +53,7 @@ def read_entry(path: Path) -> AnyEntry:
     kind: type[AnyEntry] = Entry
     if path.parent.name == "trials":
         kind = AgentEntry
-    elif content.get("track") == TRANSFER:
+    elif isinstance(content, dict) and content.get("track") == TRANSFER:
         kind = TransferEntry
     entry = parse(content, kind, str(path), exact=True)
     _check(entry, str(path))

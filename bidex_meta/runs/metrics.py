@@ -27,8 +27,8 @@ _TAIL = 65_536
 class MetricsWriter:
     """Appends to ``metrics.jsonl`` in the run folder, and to a logger of ``bidex_meta.runs.writers``.
 
-    In a resumed run, the file and the logger drop the points after ``resume_step``, the step of the checkpoint, because
-    these points are logged again.
+    In a resumed run, the file and TensorBoard drop the points after ``resume_step``, the step of the checkpoint,
+    because these points are logged again. Weights & Biases cannot drop points and shows both.
     """
 
     @checked_arguments

@@ -37,8 +37,7 @@ class Recorder:
         self._checkpoints = folder.checkpoints
         self._videos = folder.videos_path
         self._metrics = MetricsWriter(folder.path, resume_step, logger)
-        if resume_step is None:
-            self._metrics.writer.config(portable(folder.config().to_json()))
+        self._metrics.writer.config(portable(folder.config().to_json()))
         if show_progress:
             self._progress = Progress(total_steps, total_seconds, start_step=resume_step or 0)
         else:

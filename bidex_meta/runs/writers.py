@@ -25,7 +25,7 @@ class Writer:
     def __init__(self, folder: Path, resume_step: int | None = None) -> None: ...
 
     def config(self, values: Json) -> None:
-        """Log the run's config, once at the beginning."""
+        """Log the run's config, at the beginning and after each resume, because the config or the logger may change."""
 
     def scalars(self, values: Mapping[str, float], step: int) -> None:
         """Log numbers by tag at an environment step."""

@@ -327,3 +327,52 @@ def test_the_table_is_by_track_and_suite_and_claims_only_what_is_separated(tmp_p
     assert any("scout (not verified)" in line and "| 12 × 1 |" in line for line in lines)
     assert not list(leaderboard_table("MT4", tmp_path / "data"))
     assert next(iter(leaderboard_table("MT5-v2", tmp_path / "data"))) == heads[0]
+
+
+def test_entries_of_equal_success_share_a_place(tmp_path: Path, few_resamples) -> None:
+    board = tmp_path / "leaderboard"
+    for first, (name, rate) in enumerate((("best", 1.0), ("as-good", 1.0), ("third", 0.2))):
+        place_of(board, "multi-task", made("multi-task", name, rate, first=2 * first))
+    rows = [line.split("|")[1].strip() for line in list(leaderboard_table("MT5-v2", tmp_path / "data"))[4:7]]
+    assert rows == ["1", "1", "3"]
+
+
+def test_claims_say_that_an_entry_is_not_verified(tmp_path: Path, few_resamples) -> None:
+    board = tmp_path / "leaderboard"
+    place_of(board, "agent", made("agent", "scout", 1.0))
+    other = made("agent", "rl2", 0.1)
+    place_of(board, "agent", other)
+    lines = list(leaderboard_table(KINDS["agent"], tmp_path / "data"))
+    assert "| scout (not verified) | rl2 (not verified) |" in lines[-2]
+    assert "scout (not verified) better than rl2 (not verified)" in lines[-2]
+
+
+@pytest.mark.parametrize(
+    ("kind", "edits", "expected"),
+    [
+        ("reward-only", {"algorithm": "mtppo"}, "track: expected multi-task for mtppo, got reward-only"),
+        ("reward-only", {"algorithm": "icl"}, "track: expected privileged for icl, got reward-only"),
+        ("multi-task", {"algorithm": "rl2"}, "track: expected reward-only or privileged for rl2, got multi-task"),
+        ("multi-task", {"algorithm": "nosuch"}, "algorithm: Unknown algo"),
+    ],
+)
+def test_a_learner_stands_only_in_its_own_track(
+    kind: str, edits: dict[str, str], expected: str, tmp_path: Path, few_resamples
+) -> None:
+    content = sealed(made(kind) | edits, Entry, "edited")
+    path = place_of(tmp_path / "leaderboard", kind, content)
+    with pytest.raises(BidexError, match=f"{path.name}: {expected}"):
+        list(leaderboard_table("", tmp_path / "data"))
+
+
+@pytest.mark.parametrize("name", ["x <!-- end --> y", "[me](https://example.org)", "<img src=x>"])
+def test_names_hold_no_markup(name: str) -> None:
+    with pytest.raises(BidexError, match="name: expected a text"):
+        made("multi-task", name)
+
+
+def test_a_file_that_holds_no_entry_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "MT5-v2-x.json"
+    path.write_text("[]")
+    with pytest.raises(BidexError, match=path.name):
+        read_entry(path)

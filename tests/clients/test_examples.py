@@ -65,6 +65,17 @@ def test_example(
     assert example(name).main(**flags) is not None
 
 
+def test_a_search_that_goes_on_tries_other_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("optuna")
+    module = example("optuna_search")
+    monkeypatch.setattr(module, "train", lambda config, run_dir: run_dir)
+    monkeypatch.setattr(module, "evaluate", lambda run, save: SimpleNamespace(success=0.5))
+    for _ in range(2):
+        study = module.main(trials=2, out=tmp_path)
+    assert len({trial.params["learning_rate"] for trial in study.trials}) == 4
+    assert len(module.main(steps=1000, trials=1, out=tmp_path).trials) == 1, "another study, in a folder of its own"
+
+
 def test_rsl_rl_example_logs_a_suite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("rsl_rl")
     example("rsl_rl_ppo").main(suite="MT4", steps=1024, num_envs=16, log_dir=str(tmp_path))

@@ -321,6 +321,16 @@ def test_wandb_is_told_the_same_and_a_resumed_run_goes_on_there(tmp_path, monkey
     assert again[0] == again[1]
 
 
+def test_a_logger_gets_the_config_of_a_resumed_run(tmp_path, monkeypatch):
+    fake = FakeWandb()
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    folder = RunFolder.create(CONFIG, tmp_path / "run")
+    with Recorder(folder, 100, resume_step=50, logger="wandb", show_progress=False):
+        pass
+    [config] = [entry[1][0] for entry in fake.told if entry[0] == "config"]
+    assert config["steps"] == 100
+
+
 def test_none_writes_nothing_and_every_logger_takes_the_same(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", FakeWandb())
     use(make_writer("none", tmp_path), tmp_path / "a.mp4")

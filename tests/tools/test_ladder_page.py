@@ -46,8 +46,9 @@ def run(
         )  # fmt: skip
         found = MetaTestEvaluation(splits={"test": split})
         algo = arm if arm in ("icl", "maml") else "rl2"
-    content = {"steps": 1000, "seconds": 120.0, "suite": {"name": suite}}
-    config = SimpleNamespace(algo=algo, seed=seed)
+    settings = {"algo": algo, "suite": suite, "seed": seed}
+    content = {"steps": 1000, "seconds": 120.0, "suite": {"name": suite}, "config": settings}
+    config = SimpleNamespace(algo=algo, seed=seed, task=None)
     path = Path("results/data/ladder.json")
     return SimpleNamespace(arm=arm, path=path, content=content, evaluation=lambda: found, config=lambda: config)
 
@@ -169,6 +170,20 @@ def test_classes_have_success_by_shot_above_what_is_possible_without_the_goal(tm
     study.split = "others"
     with pytest.raises(BidexError, match="no meta-test of others"):
         list(adaptation_table(study))
+    study.split = None
+    study.runs[1].content["config"]["gamma"], study.runs[0].content["config"]["gamma"] = 0.1, 0.9
+    with pytest.raises(BidexError, match=r"gamma is 0\.1 and 0\.9"):
+        list(adaptation_table(study))
+
+
+def test_runs_that_are_no_seeds_of_one_setting_are_not_pooled() -> None:
+    with pytest.raises(BidexError, match="both seed 1 of the arm 'b on"):
+        table(*learners(), run("b", 1, 0.1, 0.2, 0.3))
+    runs = [*learners(), run("another blind", 3, 0.1)]
+    for each in runs:
+        each.content["config"]["gamma"] = 0.1 if each is runs[-1] else 0.9
+    with pytest.raises(BidexError, match=r"blind PPO on .*gamma is 0\.1 and 0\.9"):
+        table(*runs)
 
 
 @pytest.mark.parametrize(

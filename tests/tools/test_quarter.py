@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from bidex_meta.errors import BidexError
 from tests.tools.test_results_pages import cells
 from tools.bench import quarter as module
 from tools.bench.__main__ import main
@@ -33,6 +34,12 @@ def test_a_second_start_repeats_only_what_did_not_end_well(tmp_path: Path, monke
     assert {name: step["state"] for name, step in second.items()} == {"good": "done", "bad": "done", "slow": "cut"}
     assert (tmp_path / "good").read_text() == "x" and second["good"] == first["good"]
     assert json.loads((tmp_path / "out" / "quarter.json").read_text())["steps"] == second
+    with pytest.raises(BidexError, match=r"of the settings .*MT4-v2.*, got .*MT20-v2.*Name another --out"):
+        quarter(out=tmp_path / "out", suite="MT4-v2", minutes=1.0)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "collect_versions", lambda: {"git": {"commit": "0" * 40, "dirty": False}})
+        with pytest.raises(BidexError, match="of the code"):
+            quarter(out=tmp_path / "out", minutes=1.0)
     late = quarter(out=tmp_path / "late", minutes=0.0)
     assert late["steps"] == {}
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import tyro
 
-from bidex_meta.errors import BidexError
+from bidex_meta.errors import BidexError, one_line
 from bidex_meta.runs.atomic import Json, write_json
 from bidex_meta.runs.versions import git_state
 from bidex_meta.utils.memory import usable_cores
@@ -125,7 +125,11 @@ def checkout(other: str) -> Iterator[Path]:
 
 
 def _git(*arguments: str) -> bytes:
-    return subprocess.run(["git", *arguments], cwd=HERE, stdout=subprocess.PIPE, check=True).stdout
+    done = subprocess.run(["git", *arguments], cwd=HERE, capture_output=True)
+    if done.returncode:
+        message = one_line(done.stderr.decode(errors="replace"))
+        raise BidexError(f"git {' '.join(arguments)} failed: {message}. Name a commit of this repository.")
+    return done.stdout
 
 
 def _ratios(old: list[float], new: list[float]) -> list[float]:

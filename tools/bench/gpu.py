@@ -72,9 +72,11 @@ def gpu(
 
 
 def machine_of(device: str) -> str:
-    """Return the name of the GPU, or ``cpu``."""
+    """Return the name of the GPU, or ``cpu``; raise BidexError if there is no such GPU."""
     if torch.device(device).type == "cpu":
         return "cpu"
+    if not torch.cuda.is_available():
+        raise BidexError(f"Expected a CUDA device for {device}, found none. Give --device cpu.")
     return torch.cuda.get_device_name(device)
 
 
@@ -115,7 +117,7 @@ def _measured(
 def training_speed(world: World, preset: str) -> int:
     """Return the environment steps per second of MT-PPO's fifth iteration, whose update is a recorded graph."""
     kind = learner_kind("mtppo")
-    learner = kind.make(world, kind.presets[preset], 0)
+    learner = kind.learner_class(world, kind.presets[preset], 0)
     numbers: dict[str, float] = {}
     for _ in range(5):
         numbers = learner.iterate()

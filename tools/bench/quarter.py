@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from bidex_meta.errors import BidexError
 from bidex_meta.runs.atomic import Json, write_json
 from bidex_meta.runs.metrics import read_metrics, training_seconds
 from bidex_meta.runs.versions import collect_versions
@@ -73,14 +74,24 @@ def quarter(
 
     Returns:
         ``steps`` (state, seconds and last line of output by name), results of ``switches``, ``pictures`` and
-        ``training`` (by name), and ``versions``.
+        ``training`` (by name), ``setting``, and ``versions``.
+
+    Raises BidexError if ``out`` holds measurements of other code or with other settings.
     """
     out.mkdir(parents=True, exist_ok=True)
     end = time.monotonic() + 60.0 * minutes
     file = out / "quarter.json"
-    result: Json = {"versions": collect_versions(), "steps": {}}
+    setting = {"device": device, "suite": suite, "sizes": [*sizes], "num_envs": num_envs, "seconds": seconds}
+    result: Json = {"versions": collect_versions(), "setting": setting, "steps": {}}
     if file.exists():
-        result["steps"] = json.loads(file.read_text())["steps"]
+        stored = json.loads(file.read_text())
+        for what, known, now in (
+            ("settings", stored["setting"], setting),
+            ("code", stored["versions"].get("git"), result["versions"].get("git")),
+        ):
+            if known != now:
+                raise BidexError(f"Expected {file} to be of the {what} {now}, got {known}. Name another --out.")
+        result["steps"] = stored["steps"]
     for step in _steps(out, device, suite, sizes, num_envs, seconds, rest, end):
         left = end - time.monotonic()
         limit = min(slack * step.limit, left)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import tyro
 
+import tools
 from tools.pages.blocks import fill, filled_pages
 
 
@@ -23,4 +24,4 @@ def main(pages: tyro.conf.Positional[tuple[Path, ...]] = (), check: bool = False
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    tools.run(main)

@@ -19,6 +19,7 @@ from PIL import Image
 
 from bidex_meta.errors import BidexError
 from bidex_meta.runs import plots
+from bidex_meta.utils.files import read_text
 from tools.pages import tables
 from tools.pages.gained import adaptation_table, gains_table
 from tools.pages.gpu import gpu_table
@@ -80,7 +81,8 @@ def fill(page: Path, data: Path, check: bool = False) -> list[Path]:
     Returns the files that are written, or, with ``check``, would be written. Raises BidexError if a block does not end
     or names an unknown study or table, or if a data file cannot be read.
     """
-    text, changed = page.read_text(), []
+    text = read_text(page, "a page")
+    changed: list[Path] = []
     if text.count("<!-- results:") != text.count("<!-- end -->"):
         raise BidexError(f"{page}: a block begins with <!-- results: ... --> and ends with <!-- end -->. Fix it.")
 

@@ -10,7 +10,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.statistics import Estimate
 from bidex_meta.runs.evaluations import MetaTestEvaluation, SplitSummary
 from bidex_meta.runs.stored import StoredRun
-from tools.pages.studies import Study
+from tools.pages.studies import Study, refuse_differing
 from tools.pages.tables import mean_and_range, table
 from tools.pages.validity import read_validity
 
@@ -62,9 +62,10 @@ def adaptation_table(study: Study) -> Iterator[str]:
     A cell shows the mean over the study's runs, which are seeds of one arm, and the lowest and highest value of a run.
     "Above blind" is the success after the last shot, minus what is possible without knowing the goal according to
     ``validity/SUITE.json``. The split is the study's split, by default ``test``. Raises BidexError if a run has no
-    meta-test of the split.
+    meta-test of the split, or if the runs are not seeds of one arm.
     """
     split = study.split or "test"
+    refuse_differing(study.name, study.runs)
     parts = []
     for run in study.runs:
         if split not in _splits(run):

@@ -22,7 +22,7 @@ from bidex_meta.runs.evaluations import ClassSummary, Evaluated, MetaTestEvaluat
 from bidex_meta.runs.stored import StoredRun
 from bidex_meta.suite_files import load_suite, suite_names
 from bidex_meta.training.learner import Capability
-from tools.pages.studies import Study
+from tools.pages.studies import Study, refuse_differing
 from tools.pages.tables import mean_and_range, table
 from tools.pages.validity import share_cell
 
@@ -60,8 +60,8 @@ class Line:
     """Success in an episode with hidden rewards after all exploring episodes, for each seed that has such episodes."""
     rollouts: set[int] = field(default_factory=set)
     """Numbers of exploring episodes of a task in one shot; empty if the learner does not explore."""
-    steps: list[int] = field(default_factory=list)
-    minutes: list[float] = field(default_factory=list)
+    runs: list[StoredRun] = field(default_factory=list)
+    """The run of each seed."""
     on_train_tasks: bool = False
     """True if the results are on train tasks although the suite has other test tasks."""
 
@@ -158,8 +158,8 @@ def ladder_figure(*studies: Study) -> "Figure":
 def _suites(studies: Sequence[Study]) -> dict[str, dict[str, Line]]:
     """Group runs by meta suite and learner, and order the learners of each suite.
 
-    Goal-shown PPO comes first, then the other learners by success, and blind PPO last. Raises BidexError if only some
-    runs of a learner are evaluated on unseen tasks.
+    Goal-shown PPO comes first, then the other learners by success, and blind PPO last. Raises BidexError if the runs of
+    a learner are not seeds of one setting, or if only some of them are evaluated on unseen tasks.
     """
     found: dict[str, dict[str, Line]] = {}
     runs = [(study.split or "test", run) for study in studies for run in study.runs]
@@ -180,14 +180,16 @@ def _suites(studies: Sequence[Study]) -> dict[str, dict[str, Line]]:
                 "train tasks. Evaluate those with --other-tasks, and collect them again."
             )
         line.on_train_tasks = on_train_tasks
+        line.runs.append(run)
         line.shares.append([float(np.mean([shot[name].success for name in names])) for shot in by_shot])
         evaluation = run.evaluation()
         if isinstance(evaluation, MetaTestEvaluation):
             line.rollouts.add(_episodes_per_shot(run, evaluation, split))
             if shots := evaluation.splits[split].hidden_by_shot:
                 line.hidden.append(float(np.mean([shots[-1].classes[name].success for name in names])))
-        line.steps.append(run.content["steps"])
-        line.minutes.append(run.content["seconds"] / 60)
+    for suite, lines in found.items():
+        for learner, line in lines.items():
+            refuse_differing(f"{learner} on {suite}", line.runs)
     return {suite: dict(sorted(lines.items(), key=_place)) for suite, lines in sorted(found.items())}
 
 
@@ -270,9 +272,10 @@ def _row(name: str, line: Line, lines: dict[str, Line]) -> list[str]:
         gap = lines[SHOWN].last.mean() - low
         if gap > _LEAST_GAP:
             closed = mean_and_range(100.0 * (line.last[:, 0] - low) / gap, ".0f", " %")
-    steps = f"{int(np.mean(line.steps)):,}"
+    steps = f"{int(np.mean([run.content['steps'] for run in line.runs])):,}"
+    minutes = f"{np.mean([run.content['seconds'] for run in line.runs]) / 60:.0f}"
     rollouts = ", ".join(map(str, sorted(line.rollouts)))
-    return [name, line.given, str(len(line.shares)), steps, f"{np.mean(line.minutes):.0f}", rollouts, *shown, closed]
+    return [name, line.given, str(len(line.shares)), steps, minutes, rollouts, *shown, closed]
 
 
 def _pairs(lines: dict[str, Line]) -> Iterator[list[str]]:

@@ -8,8 +8,9 @@ from itertools import combinations
 from pathlib import Path
 from typing import get_args
 
+from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import leaderboard as board
-from bidex_meta.evaluation.entries import MULTI_TASK, SHOTS, TRANSFER, AgentEntry, AnyEntry, Entry, Track
+from bidex_meta.evaluation.entries import ADAPTATION, MULTI_TASK, SHOTS, TRANSFER, AgentEntry, AnyEntry, Entry, Track
 from bidex_meta.evaluation.statistics import NONE, iqm
 from bidex_meta.experiments.learners import learner_class
 from bidex_meta.training.learner import Capability
@@ -34,20 +35,43 @@ def leaderboard_table(suite: str, data: Path) -> Iterator[str]:
     """Yield two tables for each track of a suite: the entries, best first, and the pairs of entries.
 
     A track is one of the leaderboard's competitions, such as ``multi-task``. If ``suite`` is "", the tables cover all
-    suites.
+    suites. Raises BidexError if an entry's track is not possible for its learner.
     """
-    entries = list(board.read_entries(data.parent / "leaderboard").values())
+    by_path = board.read_entries(data.parent / "leaderboard")
+    for path, entry in by_path.items():
+        _check_track(path, entry)
+    entries = list(by_path.values())
     for track in get_args(Track):
         of_track = [entry for entry in entries if entry.track == track and suite in ("", entry.suite)]
         for name in sorted({entry.suite for entry in of_track}):
             ranked = sorted((entry for entry in of_track if entry.suite == name), key=_rank, reverse=True)
             yield from (f"**{name}, {_TITLES[track]}**", "")
             head = _HEADS.get(track, _adaptation_head)()
-            yield from table(["", "entry", *head, *_LAST], [_row(*numbered) for numbered in enumerate(ranked, 1)])
+            yield from table(["", "entry", *head, *_LAST], [_row(_place(entry, ranked), entry) for entry in ranked])
             yield ""
             if len(ranked) > 1:
                 yield from table(["first", "second", "probability that the first is better", "claim"], _pairs(ranked))
                 yield ""
+
+
+def _check_track(path: Path, entry: AnyEntry) -> None:
+    """Raise BidexError if a learner cannot be in the track of its entry, for example because it does not adapt."""
+    if isinstance(entry, AgentEntry) or entry.track == TRANSFER:
+        return
+    try:
+        kind = learner_class(entry.algorithm)
+    except BidexError as error:
+        raise BidexError(f"{path}: algorithm: {error}") from None
+    if Capability.ADAPTS not in kind.capabilities:
+        tracks = [MULTI_TASK]
+    elif kind.privileges:
+        tracks = ["privileged"]
+    else:
+        tracks = list(ADAPTATION)  # also privileged, if a run began with the policy of a run that is
+    if entry.track not in tracks:
+        raise BidexError(
+            f"{path}: track: expected {' or '.join(tracks)} for {entry.algorithm}, got {entry.track}. Submit it again."
+        )
 
 
 def _multi_task_head() -> list[str]:
@@ -69,6 +93,11 @@ _HEADS = {MULTI_TASK: _multi_task_head, TRANSFER: _transfer_head}
 
 def _rank(entry: AnyEntry) -> float:
     return float(iqm(board.success_rates(entry.result).ravel()))
+
+
+def _place(entry: AnyEntry, ranked: Sequence[AnyEntry]) -> int:
+    """Return an entry's place; entries of equal success share it."""
+    return 1 + sum(_rank(other) > _rank(entry) for other in ranked)
 
 
 def _row(place: int, entry: AnyEntry) -> list[str]:
@@ -95,11 +124,14 @@ def _episodes_per_shot(entry: AnyEntry) -> str:
     return str(entry.new.rollouts)
 
 
+def _name(entry: AnyEntry) -> str:
+    return entry.name if entry.verified else f"{entry.name} (not verified)"
+
+
 def _label(entry: AnyEntry) -> str:
-    if isinstance(entry, AgentEntry):
-        return f"{entry.name} (not verified)"
-    if entry.name == entry.algorithm:
-        return entry.name
+    """Return an entry's name and, if the name does not say it, the learner."""
+    if isinstance(entry, AgentEntry) or entry.name == entry.algorithm:
+        return _name(entry)
     return f"{entry.name} ({entry.algorithm})"
 
 
@@ -130,9 +162,9 @@ def _pairs(ranked: Sequence[AnyEntry]) -> list[list[str]]:
         low, high = found.interval or (0.0, 1.0)
         claim = "not separated"
         if low > 0.5:
-            claim = f"{first.name} better than {second.name}"
+            claim = f"{_name(first)} better than {_name(second)}"
         elif high < 0.5:
-            claim = f"{second.name} better than {first.name}"
+            claim = f"{_name(second)} better than {_name(first)}"
         runs = min(first.runs, second.runs)
         if claim != "not separated" and runs == 1:
             claim += " (policies of single runs)"
@@ -141,5 +173,5 @@ def _pairs(ranked: Sequence[AnyEntry]) -> list[list[str]]:
         probability = found.text(form=".2f")
         if first.runs == second.runs == len(first.result) == 1:
             probability = NONE  # one run on one class: it would always be 0, 1/2 or 1
-        rows.append([first.name, second.name, probability, claim])
+        rows.append([_name(first), _name(second), probability, claim])
     return rows

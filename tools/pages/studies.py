@@ -193,10 +193,19 @@ def _covered(run: StoredRun, runs: Sequence[StoredRun]) -> frozenset[str]:
 
 
 def refuse_differing(name: str, runs: Sequence[StoredRun]) -> None:
-    """Raise BidexError if two runs of an arm differ in a config entry that both have and that is not in ``_FREE``.
+    """Raise BidexError if the runs of an arm are not different seeds of one setting.
 
-    Entries that only one of the configs has are ignored, because the runs may be from different versions.
+    No two runs may have the same seed and task, or differ in a config entry that both have and that is not in
+    ``_FREE``. Entries that only one of the configs has are ignored, because the runs may be from different versions.
     """
+    by_seed: dict[tuple[str | None, int], StoredRun] = {}
+    for run in runs:
+        config = run.config()
+        known = by_seed.setdefault((config.task, config.seed), run)
+        if known is not run:
+            raise BidexError(
+                f"{run.path} and {known.path.name} are both seed {config.seed} of the arm {name!r}. Leave one out."
+            )
     for run in runs[1:]:
         same = next(known for known in runs if known.config().task == run.config().task)
         first, other = flat(same.content["config"]), flat(run.content["config"])
