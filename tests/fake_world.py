@@ -125,7 +125,7 @@ class FakeWorld(ABC):
         unscaled, success, failed = self._advance(action, moved)
         unscaled, success = torch.where(moved, unscaled, 0.0), success & ~broken
         reward = self._scaled(unscaled)
-        episodes.add(active, reward, unscaled, success)
+        episodes.add(active, reward, unscaled, success, broken)
         terminated = failed & moved | episodes.terminated
         late = (episodes.elapsed >= self.max_episode_steps) & ~terminated
         truncated = (late | broken) & active | episodes.truncated

@@ -10,7 +10,7 @@ import torch
 from bidex_meta.benchmark import Benchmark, make_task_world
 from bidex_meta.cli import main
 from bidex_meta.evaluation import filming
-from bidex_meta.experiments.policies import checkpoint
+from bidex_meta.experiments.policies import load_checkpoint
 from bidex_meta.runs import RunFolder, read_metrics
 from bidex_meta.suite_files import load_suite
 from tests.pages import ROOT
@@ -32,7 +32,7 @@ def test_a_run_reads_clouds_and_is_evaluated_on_them(algo, tmp_path, capsys):
     folder = RunFolder.open(tmp_path / "a")
     assert folder.config().points == 24 and read_metrics(folder.metrics_path)[-1]["step"] >= 64
     assert folder.evaluation().results.keys() == {"HandOver"}
-    state, _ = checkpoint(folder, "last")
+    state, _ = load_checkpoint(folder, "last")
     shapes = [each.shape for name, each in state["learner"]["policy"]["weights"].items() if "shared.0.weight" in name]
     assert torch.Size([4, 3]) in shapes, "the actor has a PointNet"
     # Commands that show the run use its own points.

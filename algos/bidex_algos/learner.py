@@ -23,7 +23,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.training.distributed import broadcast, own_seed
 from bidex_meta.training.learner import Capability, LearnerConfig, Parts, State
 from bidex_meta.training.learner import Learner as Contract
-from bidex_meta.world.contract import VectorWorld
+from bidex_meta.world.contract import VectorWorld, as_endless
 
 
 def as_numbers(tensors: dict[str, Tensor]) -> dict[str, float]:
@@ -248,7 +248,7 @@ class Learner(Contract):
 
 def _train_tasks(world: VectorWorld) -> dict[str, int]:
     """Return the number of tasks of each slot of a world; 0 stands for new tasks in each episode or trial."""
-    if getattr(world, "endless", False):
+    if as_endless(world) is not None:
         return dict.fromkeys(world.task_names, 0)
     return dict(zip(world.task_names, getattr(world, "num_slot_tasks", [1] * world.num_tasks), strict=True))
 

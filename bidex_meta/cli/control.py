@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from bidex_meta.cli.parsing import Device, Engine, JsonSwitch, RunPaths, parse
 from bidex_meta.cli.tables import Json, Sheet, gained, percent, print_table
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED
+from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.experiments.control_runs import control_runs
+from bidex_meta.experiments.metatest import ENVIRONMENTS
 from bidex_meta.runs import RunFolder
 from bidex_meta.utils.validation import Environments, Few, Seed, Shots
 
@@ -28,9 +29,9 @@ class ControlFlags:
     runs: RunPaths  # Run folders that differ only in the seed.
     trials: Few = 25  # Number of adaptations to each task, each from the unadapted policy and with new episodes.
     episodes: Few = 80  # Evaluation episodes after each adaptation.
-    shots: Shots = 2  # Adaptation rounds, one after the other.
+    shots: Shots = Protocol.shots  # Adaptation rounds, one after the other.
     rollouts: Few | None = None  # Episodes of each task in one adaptation round; None: as in training, at most 40.
-    num_envs: Environments = 1024  # Maximum number of environments stepped together; it bounds memory.
+    num_envs: Environments = ENVIRONMENTS  # Maximum number of environments stepped together; it bounds memory.
     seed: Seed = EVALUATION_SEED  # Seed of the start states of the episodes. Training never uses the default seed.
     device: Device = "auto"
     engine: Engine = "auto"

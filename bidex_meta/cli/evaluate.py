@@ -49,7 +49,7 @@ def main(arguments: Sequence[str]) -> None:
     flags = parse(EvaluateFlags, arguments, "evaluate")
     config = RunFolder.open(flags.run).config()
     where: dict[str, Any] = {"checkpoint": flags.checkpoint, "device": flags.device, "engine": flags.engine}
-    if Capability.ADAPTS in learner_kind(config.algo, config.task).make.capabilities:
+    if Capability.ADAPTS in learner_kind(config.algo, config.task).capabilities:
         _refuse_for_adapting(flags, config.algo)
         size = {entry.name: getattr(flags, entry.name) for entry in fields(Options)}
         found = meta_test(flags.run, split=flags.split, randomisation=flags.randomisation, **size, **where)

@@ -7,7 +7,7 @@ from bidex_meta.agents import Agent
 from bidex_meta.cli.parsing import LookFlags
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.evaluation.play import RandomAgent, ZeroAgent
-from bidex_meta.experiments.policies import checkpoint, fitting, policy_of, say_other_rules, slots_of
+from bidex_meta.experiments.policies import fitting, load_checkpoint, policy_of, say_other_rules, slots_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import Json
 from bidex_meta.tasks.registry import name_among
@@ -27,7 +27,7 @@ def acting(policy: str, world: TaskWorld, seed: int, which: str = "last") -> Age
     if policy == "random":
         return RandomAgent(world.action_space, seed)
     folder = RunFolder.open(Path(policy))
-    state, _ = checkpoint(folder, which)
+    state, _ = load_checkpoint(folder, which)
     with fitting(folder.path):
         shape: Json = state["learner"]["policy"].get("shape", {})
     spaces = {"observations": world.single_observation_space, "actions": world.single_action_space}
@@ -58,7 +58,8 @@ def looked_at(flags: LookFlags, all_slots: bool = False) -> tuple[Worlds, list[s
             config = replace(config, seed=run.seed, task_seed=run.task_seed)
         config = replace(config, suite=config.suite or run.suite, task=config.task or run.task)
         config = replace(config, base=run.base, points=run.points, touch=run.touch)
-        if not flags.task and not flags.object:
+        own_task = flags.task is None or flags.task.casefold() == str(run.task).casefold()
+        if own_task and flags.suite is None and flags.object is None:
             config = replace(config, object=run.object)
     if config.suite is None and config.task is None:
         raise BidexError("Name what to show: a run folder, --task TASK or --suite SUITE.")
@@ -68,7 +69,7 @@ def looked_at(flags: LookFlags, all_slots: bool = False) -> tuple[Worlds, list[s
     if flags.actor not in ("zero", "random"):
         say_other_rules(RunFolder.open(Path(flags.actor)), worlds)
     if flags.task:
-        task = name_among(name_with_object(flags.task, flags.object), classes)
+        task = name_among(name_with_object(flags.task, config.object), classes)
     else:
         task = slots[0]
     return worlds, slots, task if all_slots else known_name(f"task of {worlds.name}", task, classes)

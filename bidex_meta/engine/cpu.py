@@ -39,7 +39,7 @@ class CpuEngine(Engine):
     """
 
     device = torch.device("cpu")
-    masked = False
+    avoids_syncs = False
 
     def __init__(
         self, models: Sequence[mujoco.MjModel], rows: Sequence[int], threads: int | None = None, refresh: bool = True

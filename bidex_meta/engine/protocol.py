@@ -40,7 +40,7 @@ class Engine(Protocol):
 
     num: int
     device: torch.device
-    masked: bool
+    avoids_syncs: bool
     """True if the engine suits accelerators: resets write all rows under a mask, and nothing in a step may wait for a
     value or have a shape that depends on a value."""
     has_renderer: bool = False
@@ -88,8 +88,8 @@ class Engine(Protocol):
 
         A row of ``start`` holds ``qpos``, then the position and quaternion (w, x, y, z) of each mocap body (a fixture
         whose pose differs from task to task). ``start`` has one row for each true entry of the mask, (k, nq + 7
-        nmocap). If the engine's attribute ``masked`` is True, ``start`` has one row for every simulation instead, and
-        rows outside the mask are ignored: counting true entries would make the host wait for the device.
+        nmocap). If the engine's attribute ``avoids_syncs`` is True, ``start`` has one row for every simulation instead,
+        and rows outside the mask are ignored: counting true entries would make the host wait for the device.
         """
 
     def state_dict(self) -> dict[str, Tensor]:

@@ -56,7 +56,7 @@ class WarpEngine(Engine):
     and fill the buffers that other worlds' contacts need.
     """
 
-    masked = True
+    avoids_syncs = True
     has_renderer = True
 
     def __init__(
@@ -363,14 +363,17 @@ def _is_slow(model: mujoco.MjModel) -> bool:
 def _put_models(models: Sequence[mujoco.MjModel], rows: Sequence[int]) -> mjw.Model:
     """Return one model on the device; fields in which the given models differ are per world."""
     singles = [mjw.put_model(model) for model in models]
-    names = [name for name, value in vars(singles[0]).items() if isinstance(value, wp.array)]
-    values = {name: [vars(single)[name].numpy() for single in singles] for name in names}
-    differing = [n for n, v in values.items() if any(not np.array_equal(v[0], x, equal_nan=True) for x in v[1:])]
+    differing: dict[str, list[np.ndarray]] = {}
+    for name, field in vars(singles[0]).items():
+        if isinstance(field, wp.array):
+            values = [vars(single)[name].numpy() for single in singles]
+            if any(not np.array_equal(values[0], other, equal_nan=True) for other in values[1:]):
+                differing[name] = values
     if not differing:
         return singles[0]
     model = mjw.put_model(models[0], batch_sizes=dict.fromkeys(differing, len(rows)))
-    for name in differing:
-        vars(model)[name].assign(np.concatenate(values[name])[rows])
+    for name, values in differing.items():
+        vars(model)[name].assign(np.concatenate(values)[rows])
     return model
 
 

@@ -9,7 +9,6 @@ adaptation. The return of *own* minus that of *foreign* is the part of the gain 
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 
 import numpy as np
 
@@ -94,19 +93,31 @@ def arms(runs: Sequence[Control], class_name: str, names: Sequence[str]) -> dict
     Every entry except ``own`` also has ``own_minus``. For each measure, it holds the paired difference ``own`` minus
     this arm, with an interval over runs, adaptations and episodes, or None if the measure is missing.
     """
-    by_arm = {"before": [[run.before] for run in runs], "own": [[run.own] for run in runs]}
-    by_arm["foreign"] = [run.foreign for run in runs]
-    by_arm |= {name: [[run.foreign[i]] for run in runs] for i, name in enumerate(names)}
+    results_by_arm: dict[str, list[list[ClassResult]]] = {arm: [] for arm in ("before", "own", "foreign", *names)}
+    for run in runs:
+        foreign = [evaluation.classes[class_name] for evaluation in run.foreign]
+        results_by_arm["before"].append([run.before.classes[class_name]])
+        results_by_arm["own"].append([run.own.classes[class_name]])
+        results_by_arm["foreign"].append(foreign)
+        for i, name in enumerate(names):
+            results_by_arm[name].append([foreign[i]])
     summaries: dict[str, Json] = {}
-    for arm, evaluations in by_arm.items():
-        results = [[evaluation.classes[class_name] for evaluation in of_run] for of_run in evaluations]
-        returns = [float(np.mean([result.mean_return for result in of_run])) for of_run in results]
-        success = float(np.mean([result.success for result in chain.from_iterable(results)]))
-        summaries[arm] = {"return": float(np.mean(returns)), "success": success, "runs": returns}
+    for arm, results in results_by_arm.items():
+        summaries[arm] = _summary(results)
         if arm != "own":
             minus = {measure: _own_minus(runs, results, class_name, of) for measure, of in MEASURES.items()}
             summaries[arm]["own_minus"] = minus
     return summaries
+
+
+def _summary(results: Sequence[Sequence[ClassResult]]) -> Json:
+    """Return the means of one arm's results, which are lists of one or several results per run."""
+    returns = []
+    successes = []
+    for of_run in results:
+        returns.append(float(np.mean([result.mean_return for result in of_run])))
+        successes += [result.success for result in of_run]
+    return {"return": float(np.mean(returns)), "success": float(np.mean(successes)), "runs": returns}
 
 
 def _own_minus(

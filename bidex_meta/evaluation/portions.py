@@ -36,14 +36,21 @@ class Portions:
 
     def __init__(self, world: TaskWorld, rollouts: int | None, tasks: int | None, trials: int) -> None:
         self._pool_sizes = list(world.num_slot_tasks)
-        # This is the task of each adaptation, for each slot.
-        self._adaptations = [np.tile(np.arange(min(tasks or size, size)), trials) for size in self._pool_sizes]
-        rows = [part.stop - part.start for part in world.slot_env_ids]
-        fit = [max(1, number // (rollouts or 1)) for number in rows]
-        totals = [len(adaptations) for adaptations in self._adaptations]
-        self.count = max(-(-total // at_once) for total, at_once in zip(totals, fit, strict=True))
-        self._sizes = [-(-total // self.count) for total in totals]
-        self.rollouts = rollouts or min(number // size for number, size in zip(rows, self._sizes, strict=True))
+        self._adaptations: list[np.ndarray] = []
+        """For each slot, the task of each of its adaptations."""
+        for size in self._pool_sizes:
+            played = np.arange(min(tasks or size, size))
+            self._adaptations.append(np.tile(played, trials))
+        envs = [env_ids.stop - env_ids.start for env_ids in world.slot_env_ids]
+        counts = []
+        for num_envs, adaptations in zip(envs, self._adaptations, strict=True):
+            at_once = max(1, num_envs // (rollouts or 1))
+            counts.append(_divided_up(len(adaptations), at_once))
+        self.count = max(counts)
+        """Number of portions; the slot that needs most of them decides."""
+        self._sizes = [_divided_up(len(adaptations), self.count) for adaptations in self._adaptations]
+        most = min(num_envs // size for num_envs, size in zip(envs, self._sizes, strict=True))
+        self.rollouts = rollouts or most
 
     @contextmanager
     def applied_to(self, worlds: Sequence[TaskWorld]) -> Iterator[Iterator[int]]:
@@ -99,3 +106,8 @@ class Portions:
                 named = zip(world.task_names, own, chosen, strict=True)
                 world.set_tasks({name: tasks[numbers] for name, tasks, numbers in named})
             yield portion
+
+
+def _divided_up(number: int, by: int) -> int:
+    """Return the quotient, rounded up."""
+    return -(-number // by)

@@ -118,7 +118,7 @@ def _check(folders: Sequence[RunFolder]) -> None:
     seeds: dict[int, Path] = {}
     for folder in folders:
         config = folder.config()
-        if Capability.ADAPTS not in learner_kind(config.algo).make.capabilities:
+        if Capability.ADAPTS not in learner_kind(config.algo).capabilities:
             raise BidexError(f"{folder.path}: {config.algo} does not adapt to tasks. Name runs of maml, promp or rl2.")
         metatest.check_worlds(open_worlds(config.to_json()), config.algo)
         if (other := seeds.setdefault(config.seed, folder.path)) is not folder.path:

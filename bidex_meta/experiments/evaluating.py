@@ -1,6 +1,6 @@
 """Evaluations of a run's policy on tasks of its suite, and meta-tests of runs and of other agents that adapt."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,8 @@ from bidex_meta.evaluation.trial_agents import adapting
 from bidex_meta.experiments import metatest
 from bidex_meta.experiments.conditions import conditions
 from bidex_meta.experiments.learners import learner_kind, resolve_device
-from bidex_meta.experiments.metatest import Adaptation, Options, Played
-from bidex_meta.experiments.policies import checkpoint as load_checkpoint
-from bidex_meta.experiments.policies import policy_of
+from bidex_meta.experiments.metatest import Adaptation, EvaluationSize, Options, Played
+from bidex_meta.experiments.policies import load_checkpoint, policy_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.evaluations import (
@@ -33,7 +32,7 @@ from bidex_meta.training.launch import launch, say
 from bidex_meta.training.learner import Capability
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import portable
-from bidex_meta.utils.validation import Count, Environments, Few, Seed, Shots, check_fields
+from bidex_meta.utils.validation import Environments, Few, Seed, Shots, check_fields
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.threads import set_up_torch, torch_settings_kept
 from bidex_meta.worlds import Worlds, open_worlds
@@ -148,12 +147,9 @@ class RunMetaTest:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FinalEvaluation:
+class FinalEvaluation(EvaluationSize):
     """The evaluation at the end of training."""
 
-    episodes: Few | None = None
-    """Episodes of each task in the final evaluation. None: 4, or 1 if a task has a fixed start (metaworld/...); for
-    learners that adapt, the number of --rollouts."""
     other_tasks: Switch = False
     """In the final evaluation, also play tasks of the train classes that the run was not trained on. For learners that
     adapt, use --split others instead."""
@@ -161,15 +157,11 @@ class FinalEvaluation:
     """Tasks of the final evaluation of learners that adapt (maml, promp, rl2, ...). auto: train and test tasks (on
     ML20, tasks of fifteen train classes and of five unseen classes). others: tasks of the train classes that the run
     was not trained on. unseen: others and test."""
-    shots: Shots | None = None  # Adaptation rounds of the final evaluation, one after the other. None: 2.
-    rollouts: Few | None = None  # Episodes of each task in one round. None: as in training, but at most 40.
-    tasks: Count | None = None  # Tasks of each class in the final evaluation, the first of its pool. None: 5.
-    hidden_rewards: Switch = False  # Also repeat the final evaluation's episodes with hidden rewards.
 
     def check(self, config: AnyConfig) -> None:
         """Raise BidexError for a bad value, or for an option that the learner of a resolved config does not support."""
         check_fields(self, "run", as_flags=True)
-        adapts = Capability.ADAPTS in learner_kind(config.algo, config.task).make.capabilities
+        adapts = Capability.ADAPTS in learner_kind(config.algo, config.task).capabilities
         if adapts:
             if self.other_tasks:
                 raise BidexError(f"{config.algo} adapts: --split others plays unseen tasks of its train classes.")
@@ -177,22 +169,16 @@ class FinalEvaluation:
             return
         if self.other_tasks:
             _ = open_worlds(config.to_json()).others  # raises BidexError if there are no unseen tasks
-        if self.hidden_rewards:
-            raise BidexError(f"{config.algo} does not adapt to tasks, got --hidden-rewards. Leave it out.")
-        for name in ("split", "shots", "rollouts", "tasks"):
-            if getattr(self, name) not in (None, "auto"):
-                raise BidexError(
-                    f"--{name} is for learners that adapt (maml, promp, rl2), not {config.algo}. Leave it out."
-                )
+        if self.split != "auto":
+            raise BidexError(f"{config.algo} does not adapt to tasks, got --split {self.split}. Leave it out.")
+        self.refuse_adaptation(config.algo)
 
     def play(self, run: RunFolder, config: AnyConfig) -> "RunEvaluation | RunMetaTest":
         """Evaluate a run on the device that it was trained on, and write its ``evaluation.json``."""
         device = launch().own_device(config.device)
-        if Capability.ADAPTS in learner_kind(config.algo, config.task).make.capabilities:
-            return meta_test(
-                run, split=self.split, shots=self.shots, rollouts=self.rollouts, episodes=self.episodes,
-                tasks=self.tasks, hidden_rewards=self.hidden_rewards, device=device, engine=config.engine, save=True,
-            )  # fmt: skip
+        if Capability.ADAPTS in learner_kind(config.algo, config.task).capabilities:
+            size = {entry.name: getattr(self, entry.name) for entry in fields(EvaluationSize)}
+            return meta_test(run, split=self.split, device=device, engine=config.engine, save=True, **size)
         return evaluate(
             run, episodes=self.episodes, random=True, other_tasks=self.other_tasks, device=device,
             engine=config.engine, save=True,
@@ -242,7 +228,7 @@ def evaluate(
     """
     folder = _opened(run)
     config, worlds = _set_up(folder, device, engine, randomisation)
-    if Capability.ADAPTS in learner_kind(config.algo, config.task).make.capabilities:
+    if Capability.ADAPTS in learner_kind(config.algo, config.task).capabilities:
         raise BidexError(f"{config.algo} adapts to tasks, so its unadapted policy says little. Use meta_test(run).")
     state, steps = load_checkpoint(folder, checkpoint)
     policy = policy_of(folder, state, config.device)
@@ -319,7 +305,7 @@ def meta_test(
             if value is not None:
                 raise BidexError(f"meta_test: {name}: a run has its own, got {value}. Leave {name} out.")
         config, worlds = _set_up(folder, device, engine, randomisation)
-        if Capability.ADAPTS not in learner_kind(config.algo, config.task).make.capabilities:
+        if Capability.ADAPTS not in learner_kind(config.algo, config.task).capabilities:
             raise BidexError(f"{config.algo} does not adapt to tasks. Use evaluate(run).")
         metatest.check_worlds(worlds, config.algo)
         state, steps = load_checkpoint(folder, checkpoint)

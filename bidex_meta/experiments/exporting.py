@@ -13,8 +13,7 @@ import torch
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError, one_line
 from bidex_meta.experiments.learners import learner_kind
-from bidex_meta.experiments.policies import checkpoint as load_checkpoint
-from bidex_meta.experiments.policies import policy_of
+from bidex_meta.experiments.policies import load_checkpoint, policy_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import Json, check_writable, write_atomic
 from bidex_meta.training.learner import Capability
@@ -53,7 +52,7 @@ def export(run: str | Path, out: Path | None = None, *, checkpoint: str = "last"
         raise BidexError(f"bidex-meta export needs {', '.join(missing)}: pip install 'bidex-meta[export]'.")
     folder = RunFolder.open(run)
     config = replace(folder.config(), device="cpu")
-    if Capability.ADAPTS in learner_kind(config.algo).make.capabilities:
+    if Capability.ADAPTS in learner_kind(config.algo).capabilities:
         raise BidexError(
             f"{config.algo} adapts to tasks or remembers, and an ONNX file maps one observation to one action. "
             "Export a policy that does not adapt, such as one of mtppo, mtsac, td3, mappo, dagger or bc."

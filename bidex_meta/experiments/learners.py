@@ -8,7 +8,7 @@ from typing import Any
 
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.training.launch import launch
-from bidex_meta.training.learner import Learner
+from bidex_meta.training.learner import Capability, Learner
 from bidex_meta.utils.plugins import is_outside, outside_class
 
 ALGOS: dict[str, str] = {
@@ -57,8 +57,13 @@ class LearnerKind:
     """A learner and its presets."""
 
     name: str  # in ALGOS, or package.module:Class
-    make: type[Learner]
+    learner_class: type[Learner]
     presets: Mapping[str, Any]  # configs by name, all of the same dataclass
+
+    @property
+    def capabilities(self) -> frozenset[Capability]:
+        """Return the capabilities of the learner's class."""
+        return self.learner_class.capabilities
 
     def autoreset(self, config: dict[str, Any]) -> str:
         """Return the autoreset mode of the world that the learner trains on.
@@ -66,12 +71,12 @@ class LearnerKind:
         ``config`` maps fields of the learner's config to values; other fields have their defaults.
         """
         config_type = type(next(iter(self.presets.values())))
-        return self.make.autoreset_mode(config_type(**config))
+        return self.learner_class.autoreset_mode(config_type(**config))
 
 
 def learner_class(name: str) -> type[Learner]:
     """Return the class of a learner by its name; names and errors are those of :func:`learner_kind`."""
-    return learner_kind(name).make
+    return learner_kind(name).learner_class
 
 
 def learner_kind(name: str, task: str | None = None) -> LearnerKind:
@@ -81,8 +86,8 @@ def learner_kind(name: str, task: str | None = None) -> LearnerKind:
     class ``task`` is given, presets that the learner has for this class are included.
     """
     if is_outside(name):
-        make = _from_elsewhere(name)
-        presets = make.presets
+        found = _from_elsewhere(name)
+        presets = found.presets
     else:
         name = known_name("algo", name, ALGOS)
         module_name, _, class_name = ALGOS[name].partition(":")
@@ -90,9 +95,9 @@ def learner_kind(name: str, task: str | None = None) -> LearnerKind:
             module = vars(importlib.import_module(module_name))
         except ModuleNotFoundError as error:
             raise BidexError(f"The algo {name!r} needs {error.name}, which is not installed.") from error
-        make = module[class_name]
-        presets = make.presets or module.get("PRESETS", {})
-    return LearnerKind(name, make, {**presets, **make.task_presets.get(task or "", {})})
+        found = module[class_name]
+        presets = found.presets or module.get("PRESETS", {})
+    return LearnerKind(name, found, {**presets, **found.task_presets.get(task or "", {})})
 
 
 def _from_elsewhere(name: str) -> type[Learner]:

@@ -27,15 +27,35 @@ ENVIRONMENTS = 1024  # default maximum of environments stepped together; the wor
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options:
-    """Options of a meta-test or an evaluation: its tasks, episodes and environments."""
+class EvaluationSize:
+    """The tasks and episodes of an evaluation at the end of training (``bidex-meta run``) or of a stored run."""
 
     episodes: Few | None = None
-    """Episodes of each task; None: 4, or 1 if a task has a fixed start (metaworld/...); for learners that adapt, the
-    number of --rollouts."""
-    shots: Shots | None = None  # Adaptation rounds, one after the other, of --rollouts episodes each; None: 2.
-    rollouts: Few | None = None  # Episodes of each task in a shot; None: as in training, at most 40 (if not set: 10).
-    tasks: Few | None = None  # Number of tasks of each class to adapt to, the first of its pool; None: 5.
+    """Evaluation episodes of each task; None: 4, or 1 if a task has a fixed start (metaworld/...); for learners that
+    adapt, the number of --rollouts."""
+    shots: Shots | None = None
+    """Adaptation rounds of an evaluation, one after the other, of --rollouts episodes each; None: 2."""
+    rollouts: Few | None = None
+    """Episodes of each task in one of these rounds; None: as in training, at most 40 (if not set: 10)."""
+    tasks: Few | None = None
+    """Number of tasks of each class to adapt to in an evaluation, the first of its pool; None: 5."""
+    hidden_rewards: Switch = False
+    """For learners that adapt: also play the evaluation episodes with their rewards hidden."""
+
+    def refuse_adaptation(self, algo: str) -> None:
+        """Raise BidexError if an option is given that only concerns adaptation."""
+        for name in ("shots", "rollouts", "tasks", "trials"):
+            number = vars(self).get(name)
+            if number is not None:
+                raise BidexError(f"{algo} does not adapt to tasks, got --{name} {number}. Leave it out.")
+        if self.hidden_rewards:
+            raise BidexError(f"{algo} does not adapt to tasks, got --hidden-rewards. Leave it out.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(EvaluationSize):
+    """Options of a meta-test or an evaluation of a stored run: also trials, environments and seed."""
+
     trials: Few | None = None
     """Number of adaptations to each task, each from the unadapted policy and with new episodes; None: 1, or enough for
     five adaptations per class. Several are needed because the episodes after one adaptation show nothing about other
@@ -46,17 +66,6 @@ class Options:
     1024."""
     seed: Seed = EVALUATION_SEED
     """Seed of the start states of the evaluation episodes. Training never uses the default seed."""
-    hidden_rewards: Switch = False
-    """For learners that adapt: also play the evaluation episodes with their rewards hidden."""
-
-    def refuse_adaptation(self, algo: str) -> None:
-        """Raise BidexError if an option is given that only concerns adaptation."""
-        for name in ("shots", "rollouts", "tasks", "trials"):
-            number = getattr(self, name)
-            if number is not None:
-                raise BidexError(f"{algo} does not adapt to tasks, got --{name} {number}. Leave it out.")
-        if self.hidden_rewards:
-            raise BidexError(f"{algo} does not adapt to tasks, got --hidden-rewards. Leave it out.")
 
 
 @dataclass(frozen=True)
@@ -84,7 +93,7 @@ class Adaptation:
             counts = [len(pool) for pool in worlds.tasks("train").values()]
             of_class = config.num_envs // len(counts)
             rollouts = max(1, min(of_class // min(of_batch, max(counts)), _MOST_ROLLOUTS))
-        capabilities = learner_kind(config.algo).make.capabilities
+        capabilities = learner_kind(config.algo).capabilities
         longest = config.learner_values.get("max_adapt_steps")
         return Adaptation(config.algo, rollouts, longest, Capability.ADAPTS_INDEPENDENTLY in capabilities)
 

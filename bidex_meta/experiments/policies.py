@@ -21,7 +21,7 @@ from bidex_meta.utils.files import is_file
 from bidex_meta.worlds import Worlds, open_worlds
 
 
-def checkpoint(folder: RunFolder, which: str = "last", noted: bool = False) -> tuple[Json, int]:
+def load_checkpoint(folder: RunFolder, which: str = "last", noted: bool = False) -> tuple[Json, int]:
     """Return the state and the environment steps of a run's checkpoint; raise BidexError if there is none.
 
     ``which`` is ``last`` (the newest), ``best`` (its state has only the policy), or a file: a path, or a name in the
@@ -93,7 +93,7 @@ def load_policy(
 def policy_of(folder: RunFolder, state: Json, device: str) -> Agent:
     """Return the policy in a run's checkpoint; raise BidexError if the checkpoint does not fit the run's config."""
     with fitting(folder.path):
-        return learner_kind(folder.config().algo).make.load_policy(state["learner"]["policy"], device)
+        return learner_kind(folder.config().algo).learner_class.load_policy(state["learner"]["policy"], device)
 
 
 def policy_loader(folder: RunFolder, device: str, which: str = "last") -> tuple[Callable[[], Agent], int]:
@@ -102,7 +102,7 @@ def policy_loader(folder: RunFolder, device: str, which: str = "last") -> tuple[
     Each call of this function makes a new copy of the policy. The checkpoint is read only once, so all calls return the
     same policy even if the run is still training.
     """
-    state, step = checkpoint(folder, which)
+    state, step = load_checkpoint(folder, which)
     return lambda: policy_of(folder, state, device), step
 
 

@@ -316,7 +316,7 @@ def _actor(settings: RecordConfig, path: Path, device: str) -> tuple[Actor, Json
     """Load a run's policy; return its actor and its metadata."""
     folder = RunFolder.open(path)
     algo = folder.config().algo
-    if Capability.ADAPTS in learner_kind(algo).make.capabilities:
+    if Capability.ADAPTS in learner_kind(algo).capabilities:
         raise BidexError(f"{algo} adapts to tasks: it has no single policy to record. Name a run of another learner.")
     policy, steps = load_policy(folder, device, settings.checkpoint)
     sampled = settings.actions == "sampled" and isinstance(policy, SamplingAgent)

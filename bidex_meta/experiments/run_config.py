@@ -43,10 +43,10 @@ def resolve(config: AnyConfig, where: str = "run") -> AnyConfig:
     if config.preset == "auto" and isinstance(config.learner, LearnerConfig):
         # If the given values equal a preset, the run has that preset's name.
         preset = next((name for name, values in kind.presets.items() if values == config.learner), preset)
-    num_envs, steps = source.rows_and_steps(device, Capability.ADAPTS in kind.make.capabilities)
-    if kind.make.environments_per_class and device == "cpu":
-        num_envs = kind.make.environments_per_class * len(source.tasks("train"))
-    if Capability.OFFLINE in kind.make.capabilities:
+    num_envs, steps = source.rows_and_steps(device, Capability.ADAPTS in kind.capabilities)
+    if kind.learner_class.environments_per_class and device == "cpu":
+        num_envs = kind.learner_class.environments_per_class * len(source.tasks("train"))
+    if Capability.OFFLINE in kind.capabilities:
         num_envs = max(1, len(source.tasks("train")))  # the learner takes sizes and names from its world
         steps = run_data.UPDATES
     given: dict[str, Any] = {}
@@ -91,7 +91,7 @@ def check(config: AnyConfig, with_memory: bool = True) -> None:
         )
     if config.record:
         part_files.hdf5()  # raises BidexError if h5py is not installed
-    if config.stops_by_training and Capability.OFFLINE in kind.make.capabilities:
+    if config.stops_by_training and Capability.OFFLINE in kind.capabilities:
         raise BidexError(
             f"{config.algo} learns from data and plays no episodes: --stop-at-return and --stop-at-success need "
             "evaluations. Add for example --evaluate-every 50."
@@ -102,7 +102,7 @@ def check(config: AnyConfig, with_memory: bool = True) -> None:
     if isinstance(config.learner, LearnerConfig):
         config.learner.check_environments(config.num_envs, worlds.train_tasks())
     if with_memory and config.device.startswith("cpu"):
-        of_learner = kind.make.bytes_held(config.learner, config.num_envs, _WIDTH + 3 * config.points)
+        of_learner = kind.learner_class.bytes_held(config.learner, config.num_envs, _WIDTH + 3 * config.points)
         needed = launch().local_count * (of_learner + config.num_envs * (ROW_BYTES + config.points * POINT_BYTES))
         what = f"--num-envs {config.num_envs} ({of_learner / 1e9:,.1f} GB of it the learner's)"
         check_memory(needed, what, "Lower it, or the learner's layers, steps or replay.")

@@ -148,9 +148,9 @@ def check_offline(kind: LearnerKind, record: int, datasets: Sequence[Dataset], s
     This is the case if an offline learner has no data, or another learner has some; if ``record`` is set for an offline
     learner; if several processes share an offline run; or if the data's observations do not fit ``source``.
     """
-    if Capability.OFFLINE not in kind.make.capabilities:
+    if Capability.OFFLINE not in kind.capabilities:
         if datasets:
-            names = ", ".join(name for name in ALGOS if Capability.OFFLINE in learner_kind(name).make.capabilities)
+            names = ", ".join(name for name in ALGOS if Capability.OFFLINE in learner_kind(name).capabilities)
             raise BidexError(f"{kind.name} learns by playing; --dataset goes with {names}. Leave one of them out.")
         return
     if not datasets:
@@ -171,8 +171,8 @@ def check_demonstrations(kind: LearnerKind, names: Sequence[str], source: Worlds
     The demonstrations must be of classes of ``source``, with the same number of actions (that is, the same kind of
     bases) and fitting observations.
     """
-    if names and Capability.IMITATES not in kind.make.capabilities:
-        takers = ", ".join(name for name in ALGOS if Capability.IMITATES in learner_kind(name).make.capabilities)
+    if names and Capability.IMITATES not in kind.capabilities:
+        takers = ", ".join(name for name in ALGOS if Capability.IMITATES in learner_kind(name).capabilities)
         raise BidexError(f"{kind.name} does not imitate; --demonstrations goes with {takers}. Leave one of them out.")
     for dataset in open_datasets(names):
         classes = source.task_classes()

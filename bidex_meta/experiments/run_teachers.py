@@ -11,7 +11,7 @@ from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments import run_data
 from bidex_meta.experiments.learners import ALGOS, LearnerKind, learner_kind
-from bidex_meta.experiments.policies import checkpoint, policy_of, slots_of
+from bidex_meta.experiments.policies import load_checkpoint, policy_of, slots_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.versions import read_versions
 from bidex_meta.training.launch import launch, say
@@ -37,13 +37,13 @@ def check_teachers(kind: LearnerKind, config: RunConfig, source: Worlds) -> None
     The check is made before any world or learner is built. ``source`` is the suite or class to train on.
     """
     if not config.teacher:
-        if Capability.TAUGHT in kind.make.capabilities:
+        if Capability.TAUGHT in kind.capabilities:
             raise BidexError(f"{kind.name} learns from teachers. Add --teacher scripts, or --teacher RUN.")
         return
     if not _takes(kind):
         takers = ", ".join(name for name in ALGOS if _takes(learner_kind(name)))
         raise BidexError(f"{kind.name} has no teachers; --teacher goes with {takers}. Leave one of them out.")
-    if source.hides_goals and Capability.ADAPTS not in kind.make.capabilities:
+    if source.hides_goals and Capability.ADAPTS not in kind.capabilities:
         raise BidexError(
             f"{kind.name}: its policy cannot infer the goals that {source.name} hides. Name an MT suite, or use "
             "--algo icl."
@@ -55,7 +55,7 @@ def check_teachers(kind: LearnerKind, config: RunConfig, source: Worlds) -> None
 
 
 def _takes(kind: LearnerKind) -> bool:
-    return bool(kind.make.capabilities & {Capability.TAUGHT, Capability.IMITATES})
+    return bool(kind.capabilities & {Capability.TAUGHT, Capability.IMITATES})
 
 
 def teacher_of_class(names: Sequence[str], source: Worlds) -> dict[str, str]:
@@ -90,7 +90,7 @@ def _known_to(name: str, source: Worlds) -> set[str]:
     run's folder. Raises BidexError if there is no such class, or if the run's policy adapts to tasks.
     """
     config = RunFolder.open(Path(name)).config()
-    if Capability.ADAPTS in learner_kind(config.algo).make.capabilities:
+    if Capability.ADAPTS in learner_kind(config.algo).capabilities:
         raise BidexError(f"--teacher {name}: {config.algo} adapts to tasks; expected a policy that does not adapt.")
     other = open_worlds(config.to_json())
     own = source.task_classes()
@@ -153,7 +153,7 @@ def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teache
         rows = _rows(world, slots, learn)
         if name != SCRIPTS and len(rows):
             folder = RunFolder.open(Path(name))
-            state, steps = checkpoint(folder)
+            state, steps = load_checkpoint(folder)
             policy = policy_of(folder, state, device)
             origin = {"algo": folder.config().algo, "policy": state["learner"]["policy"]}
             other = open_worlds(folder.config().to_json())
@@ -168,7 +168,7 @@ def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teache
                 more = _appended(other, names, width).to(world.device)
             tutors.append(Tutor(policy, rows, width, more, origin, (name, steps)))
     if untaught := [task for task in classes if task not in assigned]:
-        rest = ", and not learned" * (Capability.TAUGHT in learner_kind(config.algo).make.capabilities)
+        rest = ", and not learned" * (Capability.TAUGHT in learner_kind(config.algo).capabilities)
         say(f"Without a teacher{rest}: {', '.join(untaught)}.")
     scripted = [task for task, teacher in assigned.items() if teacher == SCRIPTS]
     inner: Any = getattr(world, "unwrapped", world)  # the world without its recorder

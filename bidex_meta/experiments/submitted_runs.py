@@ -12,7 +12,7 @@ from bidex_meta.evaluation.leaderboard import content_digest
 from bidex_meta.experiments.conditions import check_worlds_of
 from bidex_meta.experiments.learners import learner_class
 from bidex_meta.experiments.metatest import check_worlds
-from bidex_meta.experiments.policies import checkpoint, fitting
+from bidex_meta.experiments.policies import fitting, load_checkpoint
 from bidex_meta.runs import RunFolder, training_seconds
 from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.checkpoints import weights_digest
@@ -103,7 +103,7 @@ def read_runs(folders: Sequence[RunFolder], *, shipped: bool = True) -> list[Sub
         check_worlds_of(folder, worlds, "An entry is of the present ones: submit with the versions in versions.json.")
     runs: dict[str, SubmittedRun] = {}
     for folder, config in zip(folders, configs, strict=True):
-        state, steps = checkpoint(folder, noted=True)
+        state, steps = load_checkpoint(folder, noted=True)
         with fitting(folder.path):
             policy = state["learner"]["policy"]
             digest = weights_digest(policy)

@@ -66,7 +66,7 @@ def states_of(plan: SweepPlan) -> list[State]:
 def _resolved(run: PlannedRun) -> AnyConfig:
     config = resolve(run.given)
     check(config)
-    if Capability.ADAPTS in learner_kind(config.algo, config.task).make.capabilities:
+    if Capability.ADAPTS in learner_kind(config.algo, config.task).capabilities:
         metatest.check_worlds(open_worlds(config.to_json()), config.algo)
     run.final.check(config)
     return config

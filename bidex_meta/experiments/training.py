@@ -12,15 +12,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 
+from bidex_meta.data.collector import RunCollector
 from bidex_meta.data.joined import join
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments import metatest, run_data, run_recording, run_teachers, watching
 from bidex_meta.experiments.learners import LearnerKind, learner_kind
-from bidex_meta.experiments.policies import checkpoint, fitting, say_other_classes, say_other_rules
+from bidex_meta.experiments.policies import fitting, load_checkpoint, say_other_classes, say_other_rules
 from bidex_meta.experiments.run_config import check, preset_reason, resolve, resumed
 from bidex_meta.runs import Recorder, RunFolder, mend, training_seconds
 from bidex_meta.runs.atomic import Json
@@ -28,7 +29,7 @@ from bidex_meta.runs.folder import AnyConfig, check_new, new_folder_name
 from bidex_meta.training import distributed, runner
 from bidex_meta.training.distributed import together
 from bidex_meta.training.launch import launch, resume_command, say
-from bidex_meta.training.learner import NO_SOURCES, Capability, Sources
+from bidex_meta.training.learner import NO_SOURCES, Capability, Learner, Sources
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.contract import VectorWorld
@@ -121,8 +122,10 @@ class _Run:
     folder: RunFolder
     kind: LearnerKind
     worlds: Worlds
-    world: Any
-    learner: Any
+    world: VectorWorld
+    collector: RunCollector | None
+    """The world again, if the run records its episodes."""
+    learner: Learner
     is_resumed: bool
 
 
@@ -158,12 +161,12 @@ def _lock(config: AnyConfig, old: RunFolder | None, new: Path | None, held: cont
             name = new_folder_name(config)
             check_new(new or name.with_name(f"{name.name}_0"))
         watching.check(config, worlds)
-    if Capability.ADAPTS in kind.make.capabilities:
+    if Capability.ADAPTS in kind.capabilities:
         metatest.check_worlds(worlds, config.algo)
     if old is None and config.start_from is not None:
         start = RunFolder.open(Path(config.start_from))
         if start.checkpoints.newest_step() is None:
-            checkpoint(start)  # raises BidexError if the run has no checkpoint
+            load_checkpoint(start)  # raises BidexError if the run has no checkpoint
 
 
 def _agree(config: AnyConfig, loaded: Checkpoint | None) -> AnyConfig:
@@ -211,13 +214,15 @@ def _begin(
     say(f"Preset {config.preset}: {preset_reason(config)}.")
     note(f"Building the world of {worlds.name}")
     autoreset = kind.autoreset(config.learner_values)
-    world: Any = together(lambda: worlds.world("train", config.num_envs, autoreset))
+    plain_world = together(lambda: worlds.world("train", config.num_envs, autoreset))
+    collector = None
     if config.record:
         if old:
             place = old.path
         else:
             place = new or new_folder_name(config)
-        world = together(lambda: run_recording.recorded(config, place, world))
+        collector = together(lambda: run_recording.recorded(config, place, plain_world))
+    world: VectorWorld = plain_world if collector is None else collector
     note("Making the learner")
     sources = together(lambda: _sources(config, worlds, world, old))
     learner = together(lambda: _make_learner(config, kind, worlds, world, sources, fresh=loaded is None))
@@ -229,14 +234,14 @@ def _begin(
     assert path is not None
     folder = RunFolder(path)
     say(f"Run folder: {folder.path}")
-    if config.record:
-        together(lambda: run_recording.begin(world, folder.path, fresh=loaded is None))
-    return _Run(folder, kind, worlds, world, learner, is_resumed=old is not None)
+    if collector is not None:
+        together(lambda: run_recording.begin(collector, folder.path, fresh=loaded is None))
+    return _Run(folder, kind, worlds, world, collector, learner, is_resumed=old is not None)
 
 
 def _make_learner(
     config: AnyConfig, kind: LearnerKind, worlds: Worlds, world: VectorWorld, sources: Sources, fresh: bool
-) -> Any:
+) -> Learner:
     """Return the learner of a config.
 
     If the run is ``fresh``, that is, not resumed, the learner starts from the policy of ``config.start_from``, if that
@@ -247,10 +252,10 @@ def _make_learner(
         more = {}
     else:
         more = {"sources": sources}
-    learner = kind.make(world, config.learner, config.seed, **more)
+    learner = kind.learner_class(world, config.learner, config.seed, **more)
     if fresh and config.start_from is not None:
         start = RunFolder.open(Path(config.start_from))
-        state, step = checkpoint(start)
+        state, step = load_checkpoint(start)
         with fitting(start.path):
             learner.start_from(state["learner"]["policy"])
         say(f"Starting from the policy of {config.start_from} at {step:,} steps.")
@@ -341,8 +346,8 @@ def _train(
             record.on_log = lambda metrics, step: call(Event("iteration", folder, step, metrics))
             on_event(Event("started", folder, learner.env_steps, {}))
         stopped = iterate(record=record, watch=watch, last=last, spent_seconds=training_seconds(rows))
-    if config.record:
-        run_recording.complete(config, run.worlds, run.world)
+    if run.collector is not None:
+        run_recording.complete(config, run.worlds, run.collector)
     if on_event is not None:
         on_event(Event("ended", folder, learner.env_steps, {}))
     if not stopped and run.is_resumed and learner.env_steps == resume_step:

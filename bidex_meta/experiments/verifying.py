@@ -11,7 +11,7 @@ from bidex_meta.evaluation.agreement import DIFFERS, EQUAL, WITHIN, Agreement, a
 from bidex_meta.experiments.conditions import conditions
 from bidex_meta.experiments.learners import learner_kind, resolve_device
 from bidex_meta.experiments.metatest import TASKS, Adaptation, Options, meta_test
-from bidex_meta.experiments.policies import checkpoint, policy_of
+from bidex_meta.experiments.policies import load_checkpoint, policy_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.evaluations import (
@@ -164,7 +164,7 @@ def _checkpoint(folder: RunFolder, steps: int) -> tuple[Json, int]:
     for which in ("last", f"step_{steps}.pt", "best"):
         there = which == "last" or exists(folder.checkpoints.folder / (f"{which}.pt" if which == "best" else which))
         if there:
-            found = checkpoint(folder, which, noted=True)
+            found = load_checkpoint(folder, which, noted=True)
         else:
             found = None
         if found is not None and found[1] == steps:
@@ -181,7 +181,7 @@ def _again(
     """Repeat the recorded evaluation, and return its results by class."""
     load = partial(policy_of, folder, state, config.device)
     seed = recorded.seed or 0
-    adapts = Capability.ADAPTS in learner_kind(config.algo).make.capabilities
+    adapts = Capability.ADAPTS in learner_kind(config.algo).capabilities
     if adapts != isinstance(recorded, MetaTestEvaluation):
         if isinstance(recorded, MetaTestEvaluation):
             kind = "a meta-test"

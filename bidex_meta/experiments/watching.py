@@ -98,10 +98,10 @@ class Watch:
         A copy is needed because an evaluation changes the memory of a recurrent policy and the weights of a policy that
         adapts.
         """
-        return self._kind.make.load_policy(self._learner.policy_state_dict(), device)
+        return self._kind.learner_class.load_policy(self._learner.policy_state_dict(), device)
 
     def _evaluate(self) -> dict[str, float]:
-        if Capability.ADAPTS in self._kind.make.capabilities:
+        if Capability.ADAPTS in self._kind.capabilities:
             metrics = self._meta_test()
         else:
             metrics = _metrics(self._judge())

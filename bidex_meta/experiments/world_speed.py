@@ -70,5 +70,5 @@ def paired_steps(full: World, bare: World, steps: int, generator: torch.Generato
             mask = part.group.take(begun)
             placement = source.group.engine.placement()
             if mask.any():
-                part.group.engine.reset(mask, placement if part.group.engine.masked else placement[mask])
+                part.group.engine.reset(mask, placement if part.group.engine.avoids_syncs else placement[mask])
     return full_time, bare_time

@@ -1,12 +1,13 @@
 """A viewer in the browser, with the library viser, for machines without a screen."""
 
+import socket
 from importlib import import_module
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from bidex_meta.errors import BidexError
+from bidex_meta.errors import BidexError, one_line
 from bidex_meta.viewer.playback import Stage
 from bidex_meta.world.rendering import GHOST_ALPHA
 
@@ -73,6 +74,19 @@ def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
+def _check_host(host: str) -> None:
+    """Raise BidexError if no server can listen at an address; viser would try for ever."""
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as probe:
+            probe.bind(address)  # at any free port
+    except OSError as error:
+        raise BidexError(
+            f"The view cannot be served at --host {host}: {one_line(error)}. Use 127.0.0.1, or 0.0.0.0 for views from "
+            "other machines."
+        ) from None
+
+
 class Browser:
     """Viewer in a web browser. It implements ``Screen``, the interface of viewers.
 
@@ -81,6 +95,7 @@ class Browser:
 
     def __init__(self, stage: Stage, host: str = "127.0.0.1", port: int = 8080, speed: float = 1.0) -> None:
         viser = import_module("viser")
+        _check_host(host)
         self.paused = False
         self.speed = speed
         self._asked: list[str] = []
@@ -99,7 +114,9 @@ class Browser:
         self._class = gui.add_dropdown("Class", options=stage.names, initial_value=stage.names[stage.row])
         self._tour = gui.add_checkbox("One class after another", stage.tour)
         self._pause = gui.add_checkbox("Pause", False)
-        self._pace = gui.add_slider("Speed", min=0.1, max=2.0, step=0.1, initial_value=min(2.0, max(0.1, self.speed)))
+        slowest = min(0.1, self.speed)
+        fastest = max(2.0, self.speed)
+        self._pace = gui.add_slider("Speed", min=slowest, max=fastest, step=0.05, initial_value=self.speed)
         for label in ("Another episode", "Next task"):
             # The server's thread calls this function; the stage runs in another thread.
             gui.add_button(label).on_click(lambda event, label=label: self._asked.append(label))

@@ -71,7 +71,7 @@ class BatchedWorld(VectorEnv, ABC):
     num_id_columns: int
     observation_groups: tuple[ObservationGroup, ...]
     success_at_end = False
-    _masked = False
+    _avoids_syncs = False
     """True if no value of a tensor may be read on the host in a step, because the host would wait for the accelerator.
     """
     _stepper: Stepper = EagerStepper()
@@ -188,7 +188,7 @@ class BatchedWorld(VectorEnv, ABC):
                 terminated = terminated & ~waiting
                 truncated = truncated & ~waiting
                 info |= {name: info[name] & ~waiting for name in ("success", "solved")}
-            if self.autoreset_mode != AutoresetMode.DISABLED and (self._masked or ended.any()):
+            if self.autoreset_mode != AutoresetMode.DISABLED and (self._avoids_syncs or ended.any()):
                 self._begin(ended, stagger=False)
             return self._obs.clone(), reward, terminated, truncated, info
 
@@ -246,12 +246,12 @@ class BatchedWorld(VectorEnv, ABC):
         unscaled = torch.where(valid, transition.reward, 0.0)
         reward = unscaled * self._scale
         episodes = self.episodes
-        episodes.add(active, reward, unscaled, solved)
+        episodes.add(active, reward, unscaled, solved, unstable)
         terminated = transition.failed & valid | episodes.terminated
         late = (episodes.elapsed >= self.max_episode_steps) & ~terminated
         truncated = (late | unstable) & active | episodes.truncated
         ended = (terminated | truncated) & active
-        if self._masked or not valid.all():  # on the CPU this check costs less than a pass over all observations
+        if self._avoids_syncs or not valid.all():  # on the CPU this check costs less than a pass over all observations
             obs = torch.where(valid[:, None], obs, self._obs)
         info: Info = {
             "success": episodes.solved_at_end if self.success_at_end else solved,
@@ -265,7 +265,7 @@ class BatchedWorld(VectorEnv, ABC):
         }
         if transition.terms:
             info["reward_terms"] = {name: torch.where(valid, term, 0.0) for name, term in transition.terms.items()}
-        if self._masked or ended.any():
+        if self._avoids_syncs or ended.any():
             info |= ended_info(info)
         self._obs = obs.clone()
         if self.autoreset_mode != AutoresetMode.SAME_STEP:

@@ -30,7 +30,8 @@ _final_obs             (N,), bool            environments whose episode ended in
                                              last observation of the episode; in all others ``final_obs`` is the
                                              observation that the step returns
 running                dict of (N,)          the episode so far: r (return, float32), l (length, int64), success (by the
-                                             suite's rule, bool), unscaled (return of unscaled rewards, float32)
+                                             suite's rule, bool; false where physics broke), unscaled (return of
+                                             unscaled rewards, float32)
 episode_mask           (N,), bool            environments whose episode ended and counts (shortened first episodes do
                                              not count)
 =====================  ====================  ===========================================================================
@@ -53,7 +54,7 @@ reset.
 """
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 import torch
@@ -196,6 +197,13 @@ class PooledWorld(TaskWorld, Protocol):
         shape, or non-finite numbers.
         """
         ...
+
+
+def as_endless(world: object) -> "EndlessWorld | None":
+    """Return the world if its suite has no fixed number of train tasks, otherwise None."""
+    if getattr(world, "endless", False):
+        return cast(EndlessWorld, world)
+    return None
 
 
 class EndlessWorld(Protocol):

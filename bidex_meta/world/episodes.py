@@ -61,11 +61,11 @@ class Episodes:
         for name in ("held", "reward", "unscaled", "length"):
             setattr(self, name, getattr(self, name).masked_fill(mask, 0))
 
-    def add(self, active: Tensor, reward: Tensor, unscaled: Tensor, solved: Tensor) -> None:
-        """Count one step of the active environments."""
+    def add(self, active: Tensor, reward: Tensor, unscaled: Tensor, solved: Tensor, unstable: Tensor) -> None:
+        """Count one step of the active environments; an episode whose physics broke is no success."""
         self.elapsed = self.elapsed + active
         self.length = self.length + active
-        self.success = self.success | (solved & active)
+        self.success = torch.where(active, (self.success | solved) & ~unstable, self.success)
         self.held = torch.where(active, (self.held + 1) * solved, self.held)
         self.reward = self.reward + reward * active
         self.unscaled = self.unscaled + unscaled * active

@@ -151,10 +151,10 @@ class Part:
     def rows_in(self, mask: Tensor) -> Tensor | None:
         """Return the engine rows of the environments of a mask (num_envs,), ascending; None stands for all rows.
 
-        Engines for accelerators (``Engine.masked``) always get None, because counting the entries of a mask would make
-        the host wait for the accelerator.
+        Engines for accelerators (``Engine.avoids_syncs``) always get None, because counting the entries of a mask would
+        make the host wait for the accelerator.
         """
-        if self._engine.masked:
+        if self._engine.avoids_syncs:
             return None
         return self.group.take(mask).nonzero().squeeze(1)
 
@@ -187,13 +187,13 @@ class Part:
         self._show_computed(values, states, rows, self._rule != "masked")
         self._observer.choose_signs(values)
         if self._sights is not None:
-            position, rotation = self._engine.body_poses()
+            body_positions, body_rotations = self._engine.body_poses()
             for member, where, _ in states:
                 if rows is None:
                     own = member.engine_rows
                 else:
                     own = rows[where]
-                self._sights[member.slot].show(values[where], position[own], rotation[own])
+                self._sights[member.slot].show(values[where], body_positions[own], body_rotations[own])
         return values.clamp_(-CLIP, CLIP)
 
     def _show_computed(
@@ -298,13 +298,23 @@ def base_rotations(parts: Sequence[Part], rows: Sequence[Tensor | None] | None =
     ``rows`` holds the engine rows of each part; None stands for all rows. All parts are computed at once, because a
     dozen operations take as long on a few rows as on all.
     """
-    mounts = [part.mounts(r) for part, r in zip(parts, rows or [None] * len(parts), strict=True)]
-    moving = [each for each in mounts if each is not None]
+    if rows is None:
+        rows = [None] * len(parts)
+    mounts = [part.mounts(chosen) for part, chosen in zip(parts, rows, strict=True)]
+    moving = [pair for pair in mounts if pair is not None]
     if not moving:
-        return [None] * len(mounts)
-    now, inverse = (torch.cat(each) for each in zip(*moving, strict=True))
-    turned = iter(roll_pitch_yaw(multiply(now, inverse)).split([len(each) for each, _ in moving]))
-    return [None if each is None else next(turned) for each in mounts]
+        return [None] * len(parts)
+    now = torch.cat([orientation for orientation, _ in moving])
+    start_inverse = torch.cat([inverse for _, inverse in moving])
+    turned = roll_pitch_yaw(multiply(now, start_inverse))
+    of_moving = iter(turned.split([len(orientation) for orientation, _ in moving]))
+    rotations: list[Tensor | None] = []
+    for pair in mounts:
+        if pair is None:
+            rotations.append(None)
+        else:
+            rotations.append(next(of_moving))
+    return rotations
 
 
 class Judgement(NamedTuple):

@@ -61,8 +61,8 @@ class Randomiser:
 
         ``number`` (n,) is the number of each environment's episode.
         """
-        masked = self._parts[0].group.engine.masked
-        if masked:
+        avoids_syncs = self._parts[0].group.engine.avoids_syncs
+        if avoids_syncs:
             env_ids = torch.arange(len(mask), device=mask.device)
         else:
             env_ids = mask.nonzero().squeeze(1)

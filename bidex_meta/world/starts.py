@@ -69,7 +69,7 @@ class Starts:
         self._task_keys = task_keys
         pools = chain.from_iterable(part.tasks for part in parts)
         self._task_size = max(tasks.shape[1] for tasks in pools)
-        self._masked = parts[0].group.engine.masked
+        self._avoids_syncs = parts[0].group.engine.avoids_syncs
         self._takes = 0
 
     def prepare(self, stepper: Stepper, mask: Tensor, number: Tensor, task_index: Tensor) -> None:
@@ -77,7 +77,7 @@ class Starts:
 
         That call must get the same mask, number and task_index.
         """
-        if self._masked:
+        if self._avoids_syncs:
             # An environment begins at most one episode per take, so counting takes replaces reading any number from the
             # device.
             if self._takes % _AHEAD == 0:
@@ -97,8 +97,8 @@ class Starts:
 
         Returns:
             Task of every environment, (n,); share of the time limit that counts as elapsed, in [0, 1), (n,); and for
-            each part the start positions (k, start_size) of its k environments in the mask. A part whose engine is
-            ``masked`` has start positions for all its environments. Values outside the mask are not valid.
+            each part the start positions (k, start_size) of its k environments in the mask. A part whose engine avoids
+            syncs has start positions for all its environments. Values outside the mask are not valid.
         """
         place = (number - self._first).clamp(max=_AHEAD - 1)[:, None]
         shares = self._new_tasks(slice(None), number)

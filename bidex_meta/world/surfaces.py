@@ -252,30 +252,40 @@ def sample(model: mujoco.MjModel, count: int, seed: int = 0) -> Surfaces:
         raise BidexError(f"Expected at least {len(geoms) or 'a geom and as many'} points, one per geom, got {count}.")
     rng = np.random.default_rng(seed)
     offsets = {geom: rng.random(2) for geom in geoms}
-    of_body = body_kinds(model)
-    seen = {geom: _in_body(model, geom, _PROBES, offsets[geom], geoms) for geom in geoms}
-    open_area = np.array([area(model, g) * len(seen[g][0]) / _PROBES for g in geoms])
+    # The share of a geom's probes that other geoms of its body do not bury tells its open area.
+    num_open = {}
+    for geom in geoms:
+        points, _ = _in_body(model, geom, _PROBES, offsets[geom], geoms)
+        num_open[geom] = len(points)
+    open_area = np.array([area(model, geom) * num_open[geom] / _PROBES for geom in geoms])
     # Only geoms that belong to the world itself use the fixtures' share. A door's frame takes its points from the
     # objects' share.
+    kinds_of_bodies = np.array(body_kinds(model))
     owners = model.geom_bodyid[geoms]
-    kinds = np.full(len(owners), OBJECT)
-    kinds[np.array(of_body)[owners] == HAND] = HAND
-    kinds[owners == 0] = FIXTURE
-    found = []
-    for geom, number in zip(geoms, _portions(open_area, kinds, count), strict=True):
-        tries = int(np.ceil(1.3 * number * _PROBES / max(len(seen[geom][0]), 1))) + 8
-        points, normals = _in_body(model, geom, tries if len(seen[geom][0]) else 0, offsets[geom], geoms)
-        found.append((geom, points[:number], normals[:number]))
-    found.sort(key=lambda each: (model.geom_bodyid[each[0]], each[0]))
-    of_geom = np.concatenate([np.full(len(points), geom) for geom, points, _ in found])
+    shares = np.full(len(owners), OBJECT)
+    shares[kinds_of_bodies[owners] == HAND] = HAND
+    shares[owners == 0] = FIXTURE
+    numbers = dict(zip(geoms, _portions(open_area, shares, count), strict=True))
+    points_of_geoms = []
+    normals_of_geoms = []
+    of_geom = []
+    for geom in sorted(geoms, key=lambda geom: (model.geom_bodyid[geom], geom)):
+        number = numbers[geom]
+        tries = 0
+        if num_open[geom]:
+            tries = int(np.ceil(1.3 * number * _PROBES / num_open[geom])) + 8
+        points, normals = _in_body(model, geom, tries, offsets[geom], geoms)
+        points_of_geoms.append(points[:number])
+        normals_of_geoms.append(normals[:number])
+        of_geom += [geom] * len(points[:number])
     bodies, counts = np.unique(model.geom_bodyid[of_geom], return_counts=True)
     return Surfaces(
         bodies=bodies,
         ends=np.cumsum(counts),
-        points=np.concatenate([points for _, points, _ in found]),
-        normals=np.concatenate([normals for _, _, normals in found]),
-        kinds=np.array([of_body[model.geom_bodyid[g]] for g in of_geom]),
-        geoms=of_geom,
+        points=np.concatenate(points_of_geoms),
+        normals=np.concatenate(normals_of_geoms),
+        kinds=kinds_of_bodies[model.geom_bodyid[of_geom]],
+        geoms=np.array(of_geom),
     )
 
 

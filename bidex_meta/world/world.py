@@ -1,7 +1,13 @@
 """The batched world of hands: all environments of a suite, stepped together.
 
-An observation is made in these steps: ``Part.advance`` (engine) -> ``sensordata`` -> ``Observer`` (gather, scale) ->
-``TaskClass.observe`` (goal blocks) -> ``World._write_ids`` (task id) -> the learner's network.
+An observation is made in these steps:
+
+1. ``Part.advance``: the engine steps and fills ``sensordata``.
+2. ``part.collect`` calls ``Part.observe`` for each part: ``Observer`` gathers and scales sensors, ``TaskClass.observe``
+   fills in the goal blocks (in a world that hides goals they stay 0), a ``DepthSensor`` adds a point cloud.
+3. ``World._finish_step`` adds noise (``_noisy``) and the task id (``_write_ids``).
+4. ``BatchedWorld._finish`` keeps the old observation where physics broke; ``BatchedWorld.step`` returns a copy.
+5. In a learner, ``ObservationNormaliser`` scales it by running statistics, and the actor reads it.
 """
 
 from collections.abc import Sequence
@@ -103,10 +109,12 @@ class World(BatchedWorld):
         self.points = config.points
         self.hides_goals = config.observation == "masked"
         groups = build_groups(self.slots, self.slot_env_ids, make_engine)
-        self._masked = groups[0].engine.masked
+        self._avoids_syncs = groups[0].engine.avoids_syncs
         self._describe_observations(groups)
-        own = (self.slots, config.observation, self.observation_size, self.num_envs, self._sights)
-        self.parts = [Part(group, *own) for group in groups]
+        self.parts: list[Part] = []
+        for group in groups:
+            part = Part(group, self.slots, config.observation, self.observation_size, self.num_envs, self._sights)
+            self.parts.append(part)
         self.randomisation = config.randomisation
         self._randomiser = None
         remembered = 0
@@ -191,8 +199,9 @@ class World(BatchedWorld):
         task_keys = None
         if self._renews_tasks:
             task_keys = self._random_keys(", tasks")
-        own = (draws, pool_size, self._side_by_side.run, task_keys, self.episodes_per_task)
-        self._starts = Starts(self.parts, self._keys, *own)
+        self._starts = Starts(
+            self.parts, self._keys, draws, pool_size, self._side_by_side.run, task_keys, self.episodes_per_task
+        )
         self._stepper.forget()  # recordings hold the old starts and pools
 
     def set_tasks(self, pools: dict[str, np.ndarray]) -> None:
@@ -299,7 +308,7 @@ class World(BatchedWorld):
     def _refresh(self, mask: Tensor) -> None:
         """Write the first observations of the episodes in the environments of a mask."""
         # Masked engines observe all environments, because shapes must not depend on the mask.
-        if self._masked:
+        if self._avoids_syncs:
             obs = torch.empty_like(self._obs)
         else:
             obs = self._obs
@@ -328,7 +337,7 @@ class World(BatchedWorld):
         turned = base_rotations(parts, rows_by_part)
         self._side_by_side.run([partial(look, *args) for args in zip(parts, rows_by_part, turned, strict=True)])
         self._write_ids(obs)
-        if self._masked:
+        if self._avoids_syncs:
             self._obs = torch.where(mask[:, None], obs, self._obs)
 
     def _noisy(self, obs: Tensor, elapsed: Tensor, env_ids: Tensor | slice = slice(None)) -> Tensor:

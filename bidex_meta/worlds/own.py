@@ -55,10 +55,13 @@ class OwnSuite(Worlds):
             # Environments are split evenly over slots, so all slots need as many as the slot with the most tasks.
             pools = self.tasks(split).values()
             rows = max(map(len, pools), default=1) * max(len(pools), 1)
-        given = split, rows, self.device, self.seed, mode or "DISABLED", self.threads, self.engine
-        randomisation = self.randomisation or mode is not None
-        physics = {"deterministic": self.deterministic, "switches": self.switches}
-        return self.benchmark.make_world(*given, randomisation=randomisation, **physics)
+        # If the config names no file, the suite's own randomisation applies in training (``mode`` is given), but not in
+        # evaluations.
+        return self.benchmark.make_world(
+            split, rows, self.device, self.seed, mode or "DISABLED", self.threads, self.engine,
+            randomisation=self.randomisation or mode is not None, deterministic=self.deterministic,
+            switches=self.switches,
+        )  # fmt: skip
 
     def tasks(self, split: str) -> dict[str, list[str]]:
         """Return the task names that the file lists, or numbers if it lists none; see ``Worlds``."""

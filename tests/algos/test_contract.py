@@ -53,14 +53,14 @@ class Case:
 
     def world(self, rows: int = 8, **broken: Any) -> Any:
         kind = learner_kind(self.algo)
-        if Capability.ADAPTS not in kind.make.capabilities:
+        if Capability.ADAPTS not in kind.capabilities:
             return ToyWorld([nearness(0.6), nearness(0.0)], rows=rows, **broken)
         classes = (PointClass("Short", steps=9, count=3), PointClass("Long", steps=20, scale=100.0, count=5))
-        mode = kind.make.autoreset_mode(self.config)
+        mode = kind.learner_class.autoreset_mode(self.config)
         return PointGoals(2 * rows, classes=classes, autoreset_mode=mode, **broken)
 
     def make(self, seed: int = 0, world: Any = None, config: Any = None) -> Any:
-        make = learner_kind(self.algo).make
+        make = learner_kind(self.algo).learner_class
         world = self.world() if world is None else world
         sources: dict[str, Any] = {}
         if Capability.OFFLINE in make.capabilities:
@@ -111,7 +111,7 @@ SHARING = {
 
 
 def capable(capability: Capability) -> list[str]:
-    return [algo for algo in ALGOS if capability in learner_kind(algo).make.capabilities]
+    return [algo for algo in ALGOS if capability in learner_kind(algo).capabilities]
 
 
 PLAYING = {name: case for name, case in CASES.items() if case.algo not in capable(Capability.OFFLINE)}
@@ -152,7 +152,7 @@ def test_training_counts_success_by_the_worlds_rule(case: Case) -> None:
     """A quarter of the episodes hold the goal at the end; the others had held it long enough, and lost it."""
     if case.algo in ("dagger", "icl"):  # their figures leave out episodes that teachers play
         case = Case(case.algo, case.options | {"teacher_steps": 0})
-    learner = case.make(world=Passing(16, learner_kind(case.algo).make.autoreset_mode(case.config)))
+    learner = case.make(world=Passing(16, learner_kind(case.algo).learner_class.autoreset_mode(case.config)))
     found: dict[str, float] = {}
     while "Train/success_rate" not in found:
         found = learner.iterate()

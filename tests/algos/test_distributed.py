@@ -80,7 +80,7 @@ def toy(rows: int = ROWS, unstable: Any = ()) -> ToyWorld:
 
 
 def make_learner(world: ToyWorld, config: Any) -> Learner:
-    return learner_kind(config.algo).make(world, config, 0)
+    return learner_kind(config.algo).learner_class(world, config, 0)
 
 
 def facts(learner: Learner) -> dict[str, torch.Tensor]:

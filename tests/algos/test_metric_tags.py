@@ -31,7 +31,7 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
     "pearl": [{"steps_per_iteration": 25}], "dagger": [{"teacher_steps": 0}],
     "icl": [{"trials": 32, "memory": 8, "teacher_steps": 0}],
 }  # fmt: skip
-PLAYING = [algo for algo in VARIANTS if Capability.OFFLINE not in learner_kind(algo).make.capabilities]
+PLAYING = [algo for algo in VARIANTS if Capability.OFFLINE not in learner_kind(algo).capabilities]
 TEAM = {"agents": "a=action/0;b=action/1"}
 OF_AGENTS = {"ippo": "mtppo", "mappo": "mtppo", "happo": "mtppo", "hatrpo": "mttrpo", "maddpg": "ddpg"}
 """Learners of several agents, and those whose tags they have."""
@@ -43,20 +43,20 @@ def told(algo: str, variants: list[dict[str, Any]]) -> set[str]:
         config = kind.presets["laptop"]
         known = {**SMALL, **options}
         config = replace(config, **{name: value for name, value in known.items() if hasattr(config, name)})
-        mode, bandits = kind.make.autoreset_mode(config), [nearness(0.5), nearness(-0.5)]
-        if Capability.ADAPTS in kind.make.capabilities:
+        mode, bandits = kind.learner_class.autoreset_mode(config), [nearness(0.5), nearness(-0.5)]
+        if Capability.ADAPTS in kind.capabilities:
             world = PointGoals(16, autoreset_mode=mode)
         else:
             world = ToyWorld(bandits, rows=8)
         sources: dict[str, Any] = {}
-        if known.get("demonstration_batch") or Capability.OFFLINE in kind.make.capabilities:
+        if known.get("demonstration_batch") or Capability.OFFLINE in kind.capabilities:
             data = as_data(played(world, noisy(lambda obs: torch.zeros(len(obs), 2), 0.5), 9))
-            sources["data" if Capability.OFFLINE in kind.make.capabilities else "demonstrations"] = data
-        if Capability.TAUGHT in kind.make.capabilities or known.get("teacher_updates"):
+            sources["data" if Capability.OFFLINE in kind.capabilities else "demonstrations"] = data
+        if Capability.TAUGHT in kind.capabilities or known.get("teacher_updates"):
             rows, width = torch.arange(world.num_envs), world.single_observation_space.shape[0]
             sources["teachers"] = Teachers(world, [Tutor(ZeroAgent(world.action_space), rows, width)])
         more = {"sources": Sources(**sources)} if sources else {}
-        learner = kind.make(world, config, 0, **more)
+        learner = kind.learner_class(world, config, 0, **more)
         for _ in range(3):
             found = learner.iterate()
         names = "|".join(map(re.escape, world.task_names))

@@ -29,7 +29,7 @@ def policy(algo: str, **options: object) -> torch.nn.Module:
     """A policy with statistics and weights of its own."""
     kind, drawn = learner_kind(algo), torch.Generator().manual_seed(0)
     config = replace(next(iter(kind.presets.values())), **options)
-    made = kind.make._make_policy(config, SHAPE, drawn, torch.device("cpu"))  # type: ignore[attr-defined]
+    made = kind.learner_class._make_policy(config, SHAPE, drawn, torch.device("cpu"))  # type: ignore[attr-defined]
     for weight in made.parameters():
         weight.data.add_(0.1 * torch.randn(weight.shape, generator=drawn))
     made.observations.update(3.0 * torch.randn(64, 16, generator=drawn) + 1.0)

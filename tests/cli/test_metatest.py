@@ -49,7 +49,7 @@ def test_flags_say_what_the_meta_test_of_a_run_plays(tmp_path, refused):
     assert "--rollouts" in refused(*flags, tmp_path / "other", "--rollouts", "0")
     assert "--hidden-rewards" in refused(*flags, tmp_path / "other", "--hidden-rewards", "--algo", "mtppo")
     other = refused(*flags, tmp_path / "other", "--shots", "2", "--algo", "mtppo")
-    assert "--shots is for learners that adapt" in other and not (tmp_path / "other").exists()
+    assert "mtppo does not adapt to tasks, got --shots 2" in other and not (tmp_path / "other").exists()
 
 
 def test_evaluate_agrees_with_the_run_and_takes_shots_rollouts_tasks_and_trials(adapted, shown):

@@ -10,7 +10,7 @@ from bidex_meta.cli.looking import looked_at
 from bidex_meta.cli.parsing import LookFlags
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments import run_data
-from bidex_meta.experiments.policies import checkpoint, policy_of
+from bidex_meta.experiments.policies import load_checkpoint, policy_of
 from bidex_meta.rules import V1, V2
 from bidex_meta.runs import RunFolder
 from bidex_meta.utils import paths
@@ -32,7 +32,7 @@ def test_a_checkpoint_that_asks_for_more_than_its_weights_takes_no_memory(
     run: str, part: str, change: dict[str, object]
 ) -> None:
     folder = RunFolder.open(trained_run(run))
-    state, _ = checkpoint(folder)
+    state, _ = load_checkpoint(folder)
     assert policy_of(folder, state, "cpu")
     state["learner"]["policy"][part] |= change
     with pytest.raises(BidexError, match="does not fit its config"):

@@ -5,6 +5,10 @@ import pytest
 from PIL import Image
 
 from bidex_meta.cli import looking, main
+from bidex_meta.cli.parsing import LookFlags
+from bidex_meta.config import RunConfig
+from bidex_meta.experiments.run_config import resolve
+from bidex_meta.runs import RunFolder
 from bidex_meta.tasks import registry
 from bidex_meta.worlds.own import OwnSuite, SingleClass
 from tests.cli.conftest import toy
@@ -36,9 +40,24 @@ def test_render_refuses_a_policy_of_other_observations(monkeypatch, toy_class, t
     capsys.readouterr()
     assert main([*flags, "--out", str(tmp_path / "a.png"), "--steps", "2"]) == 0
     shape = {"observations": 7, "actions": 1}
-    monkeypatch.setattr(looking, "checkpoint", lambda *_: ({"learner": {"policy": {"shape": shape}}}, 24))
+    monkeypatch.setattr(looking, "load_checkpoint", lambda *_: ({"learner": {"policy": {"shape": shape}}}, 24))
     assert main([*flags, "--out", str(tmp_path / "b.png"), "--steps", "2"]) == 2
     assert "takes 7 observations" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("flags", "shown"),
+    [
+        ({}, "CatchUnderarm-mug"),
+        ({"task": "catchunderarm"}, "CatchUnderarm-mug"),
+        ({"task": "CatchUnderarm", "object": "block"}, "CatchUnderarm-block"),
+        ({"task": "CatchAbreast"}, "CatchAbreast"),
+    ],
+)
+def test_a_policy_is_shown_with_the_object_of_its_run(flags, shown, tmp_path):
+    config = resolve(RunConfig(task="CatchUnderarm", object="mug", algo="ppo", device="cpu"))
+    run = RunFolder.create(config, tmp_path / "run")
+    assert looking.looked_at(LookFlags(run=run.path, **flags))[2] == shown
 
 
 def test_a_run_is_filmed_with_all_its_classes_beside_each_other(monkeypatch, toy_class, tmp_path, capsys):

@@ -142,7 +142,7 @@ def test_what_run_would_refuse_is_told_before_anything_begins(tmp_path: Path, mo
         (("steps = 6", "learner = { gamma = 3.0 }"), "gamma"),
         *[(('algos = ["ppo"]', line), told) for line, told in TOO_FEW],
         (('["ppo"]', '["promp"]'), "promp adapts to hidden goals, but HandOver shows them"),
-        (('algos = ["ppo"]', TWICE), "--shots is for learners that adapt"),
+        (('algos = ["ppo"]', TWICE), "ppo does not adapt to tasks, got --shots 3"),
     ):
         Path("s.toml").write_text(FILE.replace(*change))
         error = refused("sweep", "s.toml")

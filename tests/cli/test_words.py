@@ -55,7 +55,7 @@ def test_lists_read_from_source_are_as_the_classes_say(shown):
     for row in json.loads(shown("list", "algos", "--json")):
         kind = learner_kind(row["name"])
         assert row["presets"] == list(kind.presets) and "arXiv" in row["summary"]
-        assert (kind.make.__doc__ or "").startswith(row["summary"])
+        assert (kind.learner_class.__doc__ or "").startswith(row["summary"])
 
 
 def test_a_class_whose_docstring_gives_no_size_is_named(monkeypatch, capsys):

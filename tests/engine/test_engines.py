@@ -56,7 +56,7 @@ def other(engines: list[Either], scenes: list[Scene]) -> Either:
 
 def reset(engine: Either, mask: Tensor, start: Tensor) -> Either:
     """At starts of all rows, of which those outside the mask are ignored."""
-    engine.reset(mask, start if engine.masked else start[mask])
+    engine.reset(mask, start if engine.avoids_syncs else start[mask])
     return engine
 
 
@@ -166,7 +166,7 @@ def test_force_sensors_are_zero_after_a_reset_and_those_of_the_last_substep_afte
 
 def test_sensors_after_a_step_are_those_of_the_new_state(engine: Either, scenes: list[Scene]) -> None:
     run(engine, 4, seed=15)
-    tolerance = 2e-6 if engine.masked else 1e-12
+    tolerance = 2e-6 if engine.avoids_syncs else 1e-12
     for row, scene in enumerate(scenes):
         data = Lens(scene.model).look(engine.qpos[row], engine.qvel[row])
         mujoco.mj_sensorPos(scene.model, data)
@@ -210,7 +210,7 @@ def test_views_stay_the_engines_own_and_graphs_can_be_recorded_anew(
         engine.recapture()
     assert same(run(engine, 2, seed=14), run(other, 2, seed=14))
     reset(engine, everyone(), starts(scenes))
-    dtype = torch.float32 if engine.masked else torch.float64
+    dtype = torch.float32 if engine.avoids_syncs else torch.float64
     for name, view in views.items():
         assert getattr(engine, name).data_ptr() == view.data_ptr() and view.dtype == dtype
     assert torch.equal(views["qpos"], starts(scenes).to(dtype))

@@ -176,8 +176,8 @@ def test_our_learners_in_their_evaluation(algo):
     kind = learner_kind(algo)
     place = Benchmark("ML1").make_world("test", 12, device="cpu", autoreset_mode="DISABLED", threads=1)
     config = replace(kind.presets["laptop"], hidden=(8,), max_adapt_steps=20)
-    state = kind.make(place, config, seed=0).policy_state_dict()
-    agent, envs = ForMetaWorld(kind.make.load_policy(state, "cpu")), MetaWorldEnvs(place)
+    state = kind.learner_class(place, config, seed=0).policy_state_dict()
+    agent, envs = ForMetaWorld(kind.learner_class.load_policy(state, "cpu")), MetaWorldEnvs(place)
     with known_to_metaworld(envs):
         keywords: dict[str, Any] = {"num_evals": 1, "adaptation_episodes": 1, "evaluation_episodes": 2}
         found = theirs.metalearning_evaluation(agent, envs, **keywords)  # type: ignore[arg-type]

@@ -65,7 +65,7 @@ def against(
             for seed in range(seeds):
                 kind = learner_kind(algo)
                 config = replace(kind.presets["paper"], updates_per_iteration=min(updates, 1000))
-                learner = kind.make(world, config, seed, Sources(data))
+                learner = kind.learner_class(world, config, seed, Sources(data))
                 while learner.env_steps < updates:
                     learner.iterate()
                 ours.append(judge(learner))

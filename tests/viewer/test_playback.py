@@ -198,6 +198,7 @@ def test_what_cannot_be_played_is_one_line(monkeypatch, capsys):
         (["--policy", "random"], "a run folder, --task TASK or --suite SUITE"),
         (["--task", "CatchUnderarms"], "Did you mean 'CatchUnderarm'"),
         (["--task", "CatchUnderarm", "--speed", "0"], "speed"),
+        (["--task", "CatchUnderarm", "--browser", "--host", "203.0.113.7"], "cannot be served at --host 203.0.113.7"),
     ):
         assert main(["play", *flags]) == 2
         assert told in capsys.readouterr().err

@@ -8,7 +8,7 @@ import torch
 from bidex_meta.benchmark import Benchmark, make_task_world
 from bidex_meta.cli import main
 from bidex_meta.engine.choice import choose_engine
-from bidex_meta.experiments.policies import checkpoint
+from bidex_meta.experiments.policies import load_checkpoint
 from bidex_meta.runs import RunFolder
 from bidex_meta.world import World
 from bidex_meta.world import world as world_module
@@ -143,7 +143,7 @@ def test_a_deterministic_run_on_a_gpu_repeats(tmp_path: Path) -> None:
         argv = ["run", "--suite", "MT20", "--algo", "mtppo", "--device", "cuda:0", "--num-envs", "100"]
         argv += ["--steps", "200000", "--deterministic", "--logger", "none", "--no-evaluate", "--run-dir", out]
         assert main(argv) == 0
-        state, _ = checkpoint(RunFolder.open(out))
+        state, _ = load_checkpoint(RunFolder.open(out))
         digests.append(content_of(state["learner"]))
     assert digests[0] == digests[1]
 

@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from bidex_meta.metaworld.batched import MetaWorldWorld
 from bidex_meta.world import World, WorldConfig
+from bidex_meta.world.episodes import Episodes
 from tests.points import PointWorld, ring
 from tests.world.play import ENDS, random_actions, suite_world
 
@@ -107,3 +108,19 @@ def test_without_stagger_first_episodes_are_whole() -> None:
         assert torch.equal(info["episode_mask"], info["_final_obs"])
         ended |= info["_final_obs"]
     assert ended.any()
+
+
+@pytest.mark.parametrize("at_end", [False, True])
+def test_an_episode_whose_physics_broke_is_no_success(at_end: bool) -> None:
+    """Evaluations leave out such episodes, so that training figures and viewers must not count their success."""
+    episodes = Episodes.fresh(2, torch.device("cpu"))
+    yes = torch.ones(2, dtype=torch.bool)
+    one = torch.ones(2)
+    for _ in range(15):
+        episodes.add(yes, one, one, yes, ~yes)
+    assert episodes.statistics(at_end)["success"].tolist() == [True, True]
+    breaks = torch.tensor([True, False])
+    episodes.add(yes, one, one, ~breaks, breaks)
+    assert episodes.statistics(at_end)["success"].tolist() == [False, True]
+    episodes.add(~breaks, one, one, yes, ~yes)  # the broken episode is over
+    assert episodes.statistics(at_end)["success"].tolist() == [False, True]

@@ -32,7 +32,7 @@ def at_work() -> Iterator[None]:
 class MaskedEngine(CpuEngine):
     """C MuJoCo with the resets of an accelerator's engine."""
 
-    masked = True
+    avoids_syncs = True
 
     def reset(self, mask: Tensor, start: Tensor) -> None:
         with at_work():

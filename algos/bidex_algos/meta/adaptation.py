@@ -121,15 +121,20 @@ class Adapter:
 
     def adapt(self, params: Params, batch: TaskBatch) -> Params:
         """Return the parameters after one inner step of each task on its own batch."""
-        own = self._moved(list(params))
-        parts = [self._slopes(*part, own) for part in _parts(params, batch)]
-        slopes = {name: torch.cat([part[name] for part in parts]) for name in own}
-        if self.first_order:
-            slopes = {name: slope.detach() for name, slope in slopes.items()}
-        rate = self.learning_rate
-        factors = self.step_sizes
-        sizes = {name: rate if factors is None else rate * factors[name] for name in own}
-        return params | {name: params[name] - sizes[name] * slopes[name] for name in own}
+        moved = self._moved(list(params))
+        slopes_of_parts = [self._slopes(*part, moved) for part in _parts(params, batch)]
+        adapted = dict(params)
+        for name in moved:
+            slope = torch.cat([slopes[name] for slopes in slopes_of_parts])
+            if self.first_order:
+                slope = slope.detach()
+            adapted[name] = params[name] - self._step_size(name) * slope
+        return adapted
+
+    def _step_size(self, name: str) -> float | Tensor:
+        if self.step_sizes is None:
+            return self.learning_rate
+        return self.learning_rate * self.step_sizes[name]
 
     def _moved(self, names: list[str]) -> list[str]:
         return [name for name in names if name.startswith(self._prefix)]

@@ -2,11 +2,12 @@
 
 The learners differ only in the outer step. In an iteration every task starts from the meta-parameters. In each stage k
 = 0 ... inner_steps every environment plays an episode with its task's parameters. After each stage except the last, the
-parameters take an inner step.
+parameters take an inner step. The steps of algorithm 3 of Finn et al. (2017) are numbered in
+``MetaLearner._iterate``; ``maml.py`` and ``promp.py`` take the last one.
 """
 
 from abc import abstractmethod
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -25,7 +26,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.training.distributed import world_size
 from bidex_meta.training.learner import AutoresetMode, Capability, Parts, State
 from bidex_meta.utils import maths
-from bidex_meta.world.contract import PooledWorld
+from bidex_meta.world.contract import PooledWorld, as_endless
 
 
 class MetaPolicy(nn.Module):
@@ -173,7 +174,7 @@ class MetaLearner(Learner):
         self.steps_with_tasks = 0
         # Tasks are drawn from these pools, because the world's own pools will hold the tasks of a meta-batch.
         self.pools = [pool.copy() for pool in world.pools]
-        self.endless = getattr(world, "endless", False)
+        self.endless = as_endless(world)
         self.tasks_generator = torch.Generator().manual_seed(seed)
         self.rows = TaskRows(world.task_id)
         self.adam = torch.optim.Adam(self.policy.actor.parameters(), lr=config.outer_learning_rate)
@@ -208,6 +209,7 @@ class MetaLearner(Learner):
         return norm
 
     def _iterate(self) -> dict[str, float]:
+        # Step 1: sample a batch of tasks. Slices of running episodes keep their tasks until the episodes are over.
         if self.config.slice_steps is None or self.obs is None or self.steps_with_tasks >= self.adapt_steps:
             self._draw_tasks()
         adapter = self.policy.adapter
@@ -218,14 +220,18 @@ class MetaLearner(Learner):
         reported = dict[str, float]()
         steps = 0
         for k in range(self.config.inner_steps + 1):
+            # Step 2: sample each task's trajectories, with the meta-parameters (k = 0) or with the adapted parameters.
             with self._collecting():
                 stage, outcome = self._sample(params, seen)
                 steps += int(outcome.steps)
             log_std = params["log_std"].clamp(*adapter.log_std_range)
             batches.append(task_batch(stage, self.rows, log_std, self.config))
             reported |= self._reported(outcome, k)
+            # Step 3: adapt the parameters of each task by a gradient step on its own trajectories. No graph is kept:
+            # the outer step adapts again, on the same trajectories, to differentiate through this step.
             if k < self.config.inner_steps:
                 params = detached(adapter.adapt(params, batches[-1]))
+        # Step 4: update the meta-parameters with the trajectories that the adapted policies sampled.
         reported |= as_numbers(self._outer(batches))
         self.policy.observations.merge(seen.mean, seen.var, seen.count)
         self.env_steps += steps
@@ -250,9 +256,9 @@ class MetaLearner(Learner):
         rows, or fewer if its pool of tasks is smaller.
         """
         count = self.config.tasks_per_class
-        if self.endless:
-            world: Any = self.world  # an EndlessWorld
-            return world.fresh_tasks(int(torch.randint(2**31, (), generator=self.tasks_generator)), count)
+        if self.endless is not None:
+            number = int(torch.randint(2**31, (), generator=self.tasks_generator))
+            return self.endless.fresh_tasks(number, count)
         chosen = {}
         for name, pool in zip(self.world.task_names, self.pools, strict=True):
             order = torch.randperm(len(pool), generator=self.tasks_generator)[:count]

@@ -58,6 +58,8 @@ class MAML(MetaLearner):
         return {}
 
     def _outer(self, batches: list[TaskBatch]) -> dict[str, Tensor]:
+        # Algorithm 3, last line: update theta by the gradient of the adapted policies' losses, averaged over tasks. As
+        # in the paper's experiments the step is TRPO's; ``adam`` takes the algorithm's plain gradient step, by Adam.
         surrogate, kl = self._objective(batches)
         cfg = self.config
         if cfg.outer == "adam":
@@ -78,7 +80,10 @@ class MAML(MetaLearner):
     def _objective(self, batches: list[TaskBatch]) -> tuple[Tensor, Tensor]:
         adapter = self.policy.adapter
         params = adapter.meta(self.rows.count)
+        # Algorithm 3, line "compute adapted parameters": theta'_i = theta - alpha * gradient of the loss on D_i. The
+        # graph is kept, so the outer gradient has the inner steps' second derivatives, unless ``first_order``.
         for batch in batches[:-1]:
             params = adapter.adapt(params, batch)
+        # The loss of the adapted policies on D'_i, the trajectories that they sampled themselves.
         ratio, kl = adapter.ratio_and_kl(params, batches[-1])
         return weighted_mean(ratio * batches[-1].advantages, batches[-1].weights).mean(), kl.mean()

@@ -4,7 +4,8 @@ An environment keeps its task and plays trials of a few episodes. In the first e
 latent variable drawn from the prior. In each later episode the variable is drawn from the posterior given the trial so
 far. In an update an encoder computes posteriors from the latest trials of some environments. Actor and critics learn
 with samples of these posteriors, from all replayed transitions of these environments' tasks. The encoder minimises the
-critics' loss and the divergence from the prior. See docs/learners/pearl.md.
+critics' loss and the divergence from the prior. Comments name the lines of the paper's algorithm 1 (meta-training).
+See docs/learners/pearl.md.
 """
 
 import math
@@ -146,26 +147,39 @@ class PEARL(MTSAC):
         ).to(device)  # fmt: skip
 
     def _explore(self, obs: Tensor) -> Tensor:
+        # Algorithm 1, line "gather data from pi(a | s, z)"; ``OffPolicy._step`` adds the data to the replay.
         return self.policy.sample(self.policy.seen(obs, self.latent), self.generator)[0]
 
     def _note(self, reward: Tensor, info: Info) -> None:
         self.policy.rewards.update(self.policy.compressed(reward.masked_fill(info["unstable"], 0.0)))
-        for episodes, number in ((self.firsts, 0), (self.lasts, self.config.episodes_per_trial - 1)):
-            episodes.update(info | {"episode_mask": info["episode_mask"] & (self.played == number)})
+        for statistics, number in ((self.firsts, 0), (self.lasts, self.config.episodes_per_trial - 1)):
+            counted = info["episode_mask"] & (self.played == number)
+            statistics.update(info | {"episode_mask": counted})
         ended = info["_final_obs"]
-        self.played.add_(ended)
-        now = self.bounds[1].scatter(1, self.played[:, None], self.replay.added)
-        self.bounds[1] = torch.where(ended[:, None], now, self.bounds[1])
-        over = self.played == self.config.episodes_per_trial
-        self.bounds[0] = torch.where(over[:, None], self.bounds[1], self.bounds[0])
-        self.bounds[1] = torch.where(over[:, None], self.replay.added, self.bounds[1])
-        self.played.masked_fill_(over, 0)
+        self._note_ends(ended)
         # Here the host waits for a GPU. Posteriors of all environments would need no wait, but would pass ``context``
         # transitions per environment through the encoder in each step.
         rows = ended.nonzero().squeeze(1)
+        # Algorithm 1, lines "update the context" and "sample z ~ q(z | c)", once per episode. The context is a sample
+        # of the trial's transitions; after a trial it is empty, and z comes from the prior.
         if len(rows):
             mean, std = self.policy.posterior(self._evidence_sum(rows, torch.ones_like(rows), self.played[rows]))
             self.latent[rows] = self._sample(mean, std)
+
+    def _note_ends(self, ended: Tensor) -> None:
+        """Note that an episode ended in the environments of ``ended``, bool (N,); after its last one a trial is over.
+
+        The running trial then becomes the previous trial, and the next trial begins at the present vector step.
+        """
+        now = self.replay.added
+        previous, running = self.bounds.clone()
+        self.played.add_(ended)
+        with_end = running.scatter(1, self.played[:, None], now)
+        running = torch.where(ended[:, None], with_end, running)
+        over = self.played == self.config.episodes_per_trial
+        self.bounds[0] = torch.where(over[:, None], running, previous)
+        self.bounds[1] = torch.where(over[:, None], now, running)
+        self.played.masked_fill_(over, 0)
 
     def _sample(self, mean: Tensor, std: Tensor) -> Tensor:
         return mean + std * torch.randn(mean.shape, generator=self.generator, device=self.device)
@@ -198,8 +212,11 @@ class PEARL(MTSAC):
     def _learn(self) -> list[dict[str, Tensor]]:
         updates = self.config.updates_per_step
         classes = self.world.num_tasks
+        # Algorithm 1, line "for each task": here ``tasks_per_update`` environments, each with its task.
         within = self._below(self.of_class[:, None], updates, classes, self.chosen)
         chosen = (self.start[:, None] + within).flatten(1)
+        # Algorithm 1, line "sample an RL batch b ~ B": from all transitions of the environment's task. ``_infer``
+        # samples the context apart, from the latest trials.
         drawn = chosen[:, self.which]
         drawn = self.by_task[self.first[drawn] + self._below(self.count[drawn], *drawn.shape)]
         places = self.replay.places(drawn, self._uniform(0, self.replay.filled, *drawn.shape))
@@ -210,17 +227,23 @@ class PEARL(MTSAC):
 
     def _infer(self, rows: Tensor, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
         """Update all networks with the transitions ``draw`` (B) from the tasks of the environments ``rows`` (M,)."""
+        # Algorithm 1, line "sample context c ~ S_c(B)": from 1 to episodes_per_trial - 1 episodes of a recent trial.
         episodes = self._uniform(1, self.config.episodes_per_trial, len(rows))
         trial = (self.played[rows] >= episodes).long()
         mean, std = self.policy.posterior(self._evidence_sum(rows, trial, episodes))
+        # Algorithm 1, line "L_KL = beta * KL(q(z | c) || N(0, 1))"; beta is ``kl_weight``.
         zero = torch.zeros_like(mean)
         divergence = gaussian_kl(mean, std.log(), zero, zero).mean() / world_size()
+        # Algorithm 1, line "sample z ~ q(z | c)": one z for each chosen environment.
         latent = self._sample(mean, std)[self.which]
         seen, following = (self.policy.seen(obs, latent.detach()) for obs in (draw.obs, draw.next_obs))
+        # Algorithm 1, updates of the encoder (by L_critic + L_KL) and of the critics (by L_critic), in one step.
         reported = self._fit_critics(
             self.policy.seen(draw.obs, latent), draw, self._target(draw, following), weights, counts,
             self.config.kl_weight * divergence, self.policy.encoder.parameters()
         )  # fmt: skip
+        # Algorithm 1, update of the actor by L_actor, with the updated critics. z is detached: the encoder learns
+        # nothing from the actor.
         reported |= self._policy_step(seen, *self.policy.sample(seen, self.generator), weights, counts)
         follow(self.target_critic, self.critic, self.config.tau)
         return reported | {"Loss/divergence": all_sum(divergence.detach())}

@@ -68,11 +68,15 @@ class ProMP(MetaLearner):
         cfg = self.config
         # This group has the policy's weights. The learning rate of learned step sizes does not adapt.
         group = self.adam.param_groups[0]
+        # Algorithm 1 of the paper, loop "for step n = 0, ..., N - 1": N gradient steps on the trajectories that were
+        # sampled before the first of them (n = 0), by the policies of theta_o and of the adapted parameters.
         for epoch in range(cfg.outer_epochs):
             surrogate, inner_kl, outer_kl = self._objective(batches)
             if epoch > 0 and cfg.desired_kl is not None:  # before the first step the KL is 0 by construction
                 low, high = cfg.outer_learning_rate_range
                 group["lr"] = min(max(group["lr"] * float(factor_of(outer_kl.detach(), cfg.desired_kl)), low), high)
+            # Algorithm 1, line "update theta": Adam steps along the gradient of J^ProMP = J^CLIP - eta * KL(theta_o,
+            # theta). The paper sums over tasks, this is the mean; eta is ``kl_weight``.
             norm = self._descend(cfg.kl_weight * inner_kl - surrogate)
             measured.append(torch.stack([-surrogate, inner_kl, outer_kl, norm]).detach())
         means = torch.stack(measured).mean(0)
@@ -86,8 +90,12 @@ class ProMP(MetaLearner):
         params = adapter.meta(self.rows.count)
         inner_kl = torch.zeros((), device=self.device)
         for batch in batches[:-1]:
+            # The KL term: how far theta has moved from theta_o, which sampled these trajectories.
             inner_kl = inner_kl + adapter.ratio_and_kl(params, batch)[1].mean()
+            # Algorithm 1, line "compute adapted parameters": theta' = theta + alpha * gradient of J^LR(theta) on D_i,
+            # where J^LR is the mean of likelihood ratio times advantage.
             params = adapter.adapt(params, batch)
+        # J^CLIP: PPO's clipped objective of theta' on D'_i, relative to the adapted policies that sampled D'_i.
         last = batches[-1]
         ratio, outer_kl = adapter.ratio_and_kl(params, last)
         clipped = ratio.clamp(1.0 - clip, 1.0 + clip)

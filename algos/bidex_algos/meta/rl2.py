@@ -2,7 +2,8 @@
 
 An iteration plays one trial in every environment: a few episodes of one task with one memory. The learner makes
 ``epochs`` passes over the trial in mini-batches of chunks, which are sequences of ``chunk`` steps. The next trial
-starts with an empty memory. The first trial is only used to measure statistics.
+starts with an empty memory. The first trial is only used to measure statistics. The paper has no pseudo-code; comments
+name its sections 2.2 (formulation, figure 1), 2.3 (policy) and 2.4 (optimisation).
 """
 
 import math
@@ -23,7 +24,7 @@ from bidex_algos.nets.networks import Activation
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import RecurrentNet, RecurrentPolicy
 from bidex_algos.nets.shape import Shape
-from bidex_algos.onpolicy.ppo import NAMES, AdaptiveAdams, PPOConfig, mini_batches, policy_loss
+from bidex_algos.onpolicy.ppo import NAMES, AdaptiveAdams, OptionalRateConfig, mini_batches, policy_loss
 from bidex_meta.errors import BidexError
 from bidex_meta.training.distributed import all_sum, sum_gradients, world_size
 from bidex_meta.training.learner import Parts
@@ -32,7 +33,7 @@ from bidex_meta.world.contract import PooledWorld
 
 
 @dataclass(frozen=True)
-class RL2Config(PPOConfig):
+class RL2Config(OptionalRateConfig):
     """All options of RL²; the defaults are the preset ``laptop``."""
 
     hidden: Widths = (256, 128)  # Widths of the layers before the memory, the same for actor and critic.
@@ -143,6 +144,8 @@ class RL2(TrialLearner):
         self.return_stats = RunningStats((world.num_tasks,), max_count=horizon).to(self.device)
 
     def _iterate(self) -> dict[str, float]:
+        # Section 2.2: play a trial, several episodes of one task. The memory passes from episode to episode and is
+        # empty at the start of the next trial.
         self._play(self.trials, Sampling(self.policy, self.generator), self.config.blind_share)
         filled = self.trials.filled()
         valid = self.trials.valid & filled
@@ -154,7 +157,9 @@ class RL2(TrialLearner):
             losses = {}
             explained = self._prepare()[1]
         else:
+            # Section 2.2: the objective is the discounted reward of the whole trial, not of an episode; see make_batch.
             batch, explained = self._prepare()
+            # Section 2.4: optimise the recurrent policy. The paper uses TRPO; this is PPO.
             losses = self._update(batch)
             self.policy.update_statistics(*seen)
         self._count(self.trials)
@@ -173,6 +178,8 @@ class RL2(TrialLearner):
         weights = b.weights.unflatten(0, (-1, b.size)).sum(1)[b.chunk, b.row]  # weights of each chunk (S,)
         batches = mini_batches(weights, cfg.epochs, cfg.num_minibatches, self.generator, Tensor.tensor_split)
         for first, index, count in batches:
+            # PPO's step on a mini-batch of chunks: gradients of policy and critic, then a step of Adam, whose size
+            # follows the KL (element 2) of the mini-batch. The first mini-batch's KL is 0.
             measured.append(self._gradients(b, index, count, old_log_std))
             self.adams.descend(None if first else measured[-1][2], cfg.max_grad_norm)
             with torch.no_grad():
@@ -201,7 +208,10 @@ class RL2(TrialLearner):
         """
         chunk = b.chunk[chosen]
         row = b.row[chosen]
+        # Section 2.3: each step reads the observation, the last action, the last reward and the end of an episode.
         x = self.policy.see(b.take(b.obs, chosen), *(b.take(p, chosen) for p in b.previous))
+        # Section 2.4: the baseline has a GRU too. Gradients flow through the steps of a chunk, not into its first
+        # memory, which was computed before the update.
         means, _ = self.policy.actor(x, b.actor_states[chunk, row])
         values, _ = self.critic(x, b.critic_states[chunk, row])
         return means, values

@@ -13,7 +13,7 @@ from bidex_algos.nets.recurrent import RecurrentPolicy
 from bidex_algos.rollout import EpisodeStatistics
 from bidex_meta.training.distributed import all_sum, own_seed, rank, world_size
 from bidex_meta.training.learner import AutoresetMode, Capability, State
-from bidex_meta.world.contract import PooledWorld
+from bidex_meta.world.contract import PooledWorld, as_endless
 
 
 def of_episodes(firsts: EpisodeStatistics, lasts: EpisodeStatistics) -> dict[str, float]:
@@ -53,7 +53,7 @@ class TrialLearner(Learner):
         each = zip(world.task_names, world.pools, rows, strict=True)
         self.pools = {name: (torch.tensor(pool), count) for name, pool, count in each if count < len(pool)}
         self.most_rows = max(rows)
-        self.endless = getattr(world, "endless", False)
+        self.endless = as_endless(world)
 
     @classmethod
     def autoreset_mode(cls, config: Any) -> AutoresetMode:
@@ -74,9 +74,8 @@ class TrialLearner(Learner):
 
     def _begin(self) -> Tensor:
         trial = self.trials_played * world_size() + rank()
-        if self.endless:
-            world: Any = self.world  # an EndlessWorld
-            world.set_tasks(world.fresh_tasks(trial, self.most_rows))
+        if self.endless is not None:
+            self.world.set_tasks(self.endless.fresh_tasks(trial, self.most_rows))
         elif self.pools:
             # The pool rotates, so all tasks of a class are played equally often.
             turned = {name: pool.roll(-trial * rows, 0).numpy() for name, (pool, rows) in self.pools.items()}

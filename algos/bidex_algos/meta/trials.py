@@ -289,7 +289,8 @@ def make_batch(
     valid = t.valid[:slots] & filled
     # The value after the trial's last slot is never used.
     next_values = torch.cat([values[1:], values[-1:]])
-    # The end of an episode does not end the trial, because the next episode continues with the same memory.
+    # RL² maximises the discounted reward of the whole trial (Duan et al. 2016, section 2.2). The end of an episode
+    # therefore does not end the trial: the next episode continues with the same memory.
     advantages = gae(
         t.rewards[:slots], values, next_values, terminated=t.terminated[:slots] & last, ended=last,
         gamma=t.discounts(slots, config.gamma), lam=config.lam, valid=valid

@@ -3,7 +3,8 @@
 An encoder turns the trial so far into a belief: a Gaussian over a latent variable. From a sample of the latent a
 decoder predicts the rewards of the whole trial; the error of this prediction trains encoder and decoder. Policy and
 critic read the belief. PPO trains policy and critic but not the encoder, so the beliefs about a trial are computed only
-once.
+once. Comments name the parts of the paper's objective (section 3): the return of the policy plus, for each time t, the
+evidence lower bound ELBO_t, which is a reconstruction term minus the KL from the previous belief.
 """
 
 from dataclasses import dataclass
@@ -155,7 +156,10 @@ class VariBAD(RL2):
 
     def _update(self, b: Batch) -> dict[str, Tensor]:
         """Run PPO's update with the beliefs of the played trial, then update encoder and decoder."""
+        # Section 3.2, the policy's term J: only policy and critic learn from it, as in the paper's experiments.
         losses = super()._update(b)
+        # Section 3.2, the sum of ELBO_t: encoder and decoder learn from it, with an optimiser of their own. The paper
+        # draws trajectories from a buffer; here they are those of the trial just played.
         ones = torch.ones(b.weights.shape[1], device=self.device)
         number = min(_BATCHES, self.config.num_minibatches)
         batches = mini_batches(ones, self.config.epochs, number, self.generator, Tensor.tensor_split)
@@ -184,6 +188,8 @@ class VariBAD(RL2):
         Returns the reward error and the KL divergence of :meth:`_elbo_terms`, summed over all processes, (2,).
         """
         reward, divergence = self._elbo_terms(b, chosen)
+        # Descend minus the ELBO. The reward error is a mean over the trial's rewards where the paper has a sum, so the
+        # KL is divided by the number of slots.
         self.model_adam.zero_grad()
         (reward + self.config.kl_weight / len(b.weights) * divergence).backward()
         found = sum_gradients(self.model, torch.stack([reward, divergence]).detach())
@@ -201,20 +207,31 @@ class VariBAD(RL2):
         policy = self.policy
         net = self.net
         previous = [each[:, chosen] for each in b.previous]
+        _, last_reward, _, begins = previous
         x = policy.see(b.obs[:, chosen], *previous)
         valid = b.weights[:, chosen]
+        # The posterior q(m | trial up to t) at each time t.
         mean, log_std, _ = net.believe(x, b.actor_states[0, chosen])
-        before = (torch.cat([torch.zeros_like(each[:1]), each[:-1]]) for each in (mean, log_std))
-        divergence = valid * gaussian_kl(mean, log_std, *before)
-        # A slot shows the reward of the previous step, but after the end of an episode not the state that the step led
-        # to.
-        paid = torch.cat([torch.zeros_like(valid[:1]), valid[:-1]]).masked_fill(previous[3], 0.0)
-        time, step = (torch.randperm(len(x), generator=self.generator, device=x.device)[:k] for k in (_TIMES, _STEPS))
+        # ELBO_t's second term: the KL from the previous posterior; at the first step from the prior N(0, 1).
+        divergence = valid * gaussian_kl(mean, log_std, _delayed(mean), _delayed(log_std))
+        # ELBO_t's first term: from a sample of q at time t, predict the rewards of the whole trial, past and future.
+        # Both t and the predicted steps are subsampled. There is no decoder of states.
+        time = torch.randperm(len(x), generator=self.generator, device=x.device)[:_TIMES]
+        step = torch.randperm(len(x), generator=self.generator, device=x.device)[:_STEPS]
         noise = torch.randn(mean[time].shape, generator=self.generator, device=x.device)
-        off = net.decode_reward(x[step], mean[time] + log_std[time].exp() * noise) - policy.earned(previous[1])[step]
-        weights = valid[time][:, None] * paid[step]
+        latent = mean[time] + log_std[time].exp() * noise
+        errors = (net.decode_reward(x[step], latent) - policy.earned(last_reward)[step]).square()
+        # A slot shows the reward of the previous step, but after the end of an episode not the state that the step led
+        # to: such rewards are not predicted.
+        has_reward = _delayed(valid).masked_fill(begins, 0.0)
+        weights = valid[time][:, None] * has_reward[step]
         count = all_sum(torch.stack([weights.sum(), valid.sum()])).clamp_min(1.0)
-        return (weights * off.square()).sum() / count[0], divergence.sum() / count[1]
+        return (weights * errors).sum() / count[0], divergence.sum() / count[1]
 
     def _parts(self) -> Parts:
         return {**super()._parts(), "model_adam": self.model_adam}
+
+
+def _delayed(x: Tensor) -> Tensor:
+    """Return for each step the entry of ``x`` (T, ...) of the step before, and zeros for the first step."""
+    return torch.cat([torch.zeros_like(x[:1]), x[:-1]])

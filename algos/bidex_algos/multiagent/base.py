@@ -20,7 +20,7 @@ from bidex_algos.nets.networks import MLP, autocast, gaussian_log_prob
 from bidex_algos.nets.policy import GaussianPolicy
 from bidex_algos.nets.shape import Shape
 from bidex_algos.onpolicy.base import Batch, OnPolicy, OnPolicyConfig
-from bidex_algos.onpolicy.ppo import AdaptiveAdam, PPOConfig, mini_batches
+from bidex_algos.onpolicy.ppo import AdaptiveAdam, OptionalRateConfig, mini_batches
 from bidex_algos.rollout import check_samples
 from bidex_meta.errors import BidexError
 from bidex_meta.hands.units import partition_line
@@ -68,9 +68,10 @@ class MultiAgentConfig(OnPolicyConfig):
 
 
 @dataclass(frozen=True)
-class MultiAgentPPOConfig(PPOConfig, MultiAgentConfig):
+class MultiAgentPPOConfig(OptionalRateConfig, MultiAgentConfig):
     """Options shared by IPPO, MAPPO and HAPPO; the defaults are the preset ``laptop``."""
 
+    # These two fields narrow those of PPOConfig: the critic has its own step size, and agents share the KL.
     critic_learning_rate: Positive = 1e-3  # Adam's step size of the critic.
     value_loss_weight: Finite = 1.0  # Factor of the value loss; it only matters for max_grad_norm, as Adam cancels it.
     entropy_weight: Finite = 0.0  # Factor of the entropy bonus.

@@ -66,5 +66,7 @@ class HATRPO(Sequential):
         own = kl_from_itself(of_taken, share.weights, self.world.num_envs, cfg.fisher_stride)
         distribution = partial(self._distribution, agent, share)
         bounds = partial(actor.clamp_std, *cfg.std_range)
-        given = share, share.gain, share.old_log_std, own, cfg
-        return gaussian_step(actor.parameters_of(agent), distribution, bounds, *given, self.kl_share * cfg.max_kl)
+        return gaussian_step(
+            actor.parameters_of(agent), distribution, bounds, share, share.gain, share.old_log_std, own, cfg,
+            self.kl_share * cfg.max_kl
+        )  # fmt: skip

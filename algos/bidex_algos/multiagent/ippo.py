@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor, nn
 
 from bidex_algos.multiagent.base import LIFT
-from bidex_algos.multiagent.mappo import MAPPO, MAPPOConfig
-from bidex_algos.multiagent.mappo import PRESETS as MAPPO_PRESETS
+from bidex_algos.multiagent.mappo import MAPPO, TABLE_45, MAPPOConfig
 from bidex_algos.multiagent.team import TeamCritic
 from bidex_algos.nets.networks import MLP, autocast
 from bidex_algos.nets.policy import of_head
@@ -31,7 +30,7 @@ class IPPOConfig(MAPPOConfig):
 
 PRESETS: dict[str, IPPOConfig] = {
     # There is no table for IPPO, so the values are MAPPO's. B.2.1 describes a policy and a critic for each agent.
-    "paper": IPPOConfig(**vars(replace(MAPPO_PRESETS["paper"], share_parameters=False))),
+    "paper": IPPOConfig(**TABLE_45),
     "laptop": IPPOConfig(),
 }
 TASK_PRESETS = {"LiftUnderarm": {"paper": replace(PRESETS["paper"], **LIFT)}}

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from bidex_algos.multiagent.base import LIFT, PAPER_PPO, MultiAgentPPOConfig, OwnAdams
+from bidex_algos.nets.architecture import Options
 from bidex_algos.nets.networks import autocast, gaussian_log_prob
 from bidex_algos.onpolicy.base import Batch
 from bidex_algos.onpolicy.ppo import NAMES, PolicyLoss, mini_batches, policy_loss
@@ -25,15 +26,15 @@ class MAPPOConfig(MultiAgentPPOConfig):
     includes a one-hot of the agent."""
 
 
-PRESETS: dict[str, MAPPOConfig] = {
-    # These values are from Table 45. Its std is 0.5 sigmoid(s), initially with s = 1 (std y and x coef). B.2.4
-    # describes one policy for all agents.
-    "paper": MAPPOConfig(
-        **PAPER_PPO, learning_rate=5e-4, critic_learning_rate=5e-4, max_grad_norm=10.0, adam_eps=5e-4,
-        init_std=0.3655, std_range=(0.01, 0.5), share_parameters=True,
-    ),
-    "laptop": MAPPOConfig(),
+# The std of Table 45 is 0.5 sigmoid(s), initially with s = 1 (std y and x coef).
+TABLE_45: Options = PAPER_PPO | {
+    "learning_rate": 5e-4, "critic_learning_rate": 5e-4, "max_grad_norm": 10.0, "adam_eps": 5e-4, "init_std": 0.3655,
+    "std_range": (0.01, 0.5),
 }  # fmt: skip
+PRESETS: dict[str, MAPPOConfig] = {
+    "paper": MAPPOConfig(**TABLE_45, share_parameters=True),  # B.2.4 describes one policy for all agents
+    "laptop": MAPPOConfig(),
+}
 TASK_PRESETS = {"LiftUnderarm": {"paper": replace(PRESETS["paper"], **LIFT)}}
 
 
@@ -76,15 +77,19 @@ class MAPPO(OwnAdams):
         losses = self._agent_losses(b, weights, old_log_std)
         value = self._value_loss(b, old_values, weights)
         # Agents that share a network get the mean of their losses (B.2.4), other agents their own loss.
-        share = [1.0 / actor.net_of.count(net) for net in actor.net_of]
-        surrogate = torch.stack([part * loss.surrogate for part, loss in zip(share, losses, strict=True)]).sum()
-        entropy = torch.stack([part * loss.entropy for part, loss in zip(share, losses, strict=True)]).sum()
-        kls = [loss.kl for loss in losses]
-        of_nets = [[kl for kl, k in zip(kls, actor.net_of, strict=True) if k == net] for net in range(len(self.adams))]
-        outside = torch.stack([loss.outside for loss in losses]).mean()
-        earned = torch.stack([loss.surrogate.detach() for loss in losses]).mean()
-        numbers = [earned, value.detach() / self.num_critics, torch.stack(kls).mean(), outside]
-        numbers += [torch.stack(of_net).mean() for of_net in of_nets]
+        shares = [1.0 / actor.net_of.count(net) for net in actor.net_of]
+        surrogate = _weighted_sum(shares, [loss.surrogate for loss in losses])
+        entropy = _weighted_sum(shares, [loss.entropy for loss in losses])
+        kls_of_net: list[list[Tensor]] = [[] for _ in self.adams]
+        for net, loss in zip(actor.net_of, losses, strict=True):
+            kls_of_net[net].append(loss.kl)
+        numbers = [
+            torch.stack([loss.surrogate.detach() for loss in losses]).mean(),
+            value.detach() / self.num_critics,
+            torch.stack([loss.kl for loss in losses]).mean(),
+            torch.stack([loss.outside for loss in losses]).mean(),
+        ]
+        numbers += [torch.stack(kls).mean() for kls in kls_of_net]
         for adam in self.adams:
             adam.zero_grad()
         self.critic_adam.zero_grad()
@@ -105,6 +110,14 @@ class MAPPO(OwnAdams):
         for agent, (actions, old_means, old_std) in enumerate(given):
             log_std = actor.own_log_std(agent, task)
             old_log_probs = b.old_log_probs[:, agent]
-            old = old_means, old_std, old_log_probs, advantages[:, agent]
-            losses.append(policy_loss(actions, means[agent], log_std, *old, weights=weights, clip=self.config.clip))
+            loss = policy_loss(
+                actions, means[agent], log_std, old_means, old_std, old_log_probs, advantages[:, agent],
+                weights=weights, clip=self.config.clip
+            )  # fmt: skip
+            losses.append(loss)
         return losses
+
+
+def _weighted_sum(weights: list[float], terms: list[Tensor]) -> Tensor:
+    """Return the sum of scalars, each times its weight."""
+    return torch.stack([weight * term for weight, term in zip(weights, terms, strict=True)]).sum()

@@ -156,40 +156,52 @@ class OnPolicy(Learner):
     def _prepare(self) -> tuple[Batch, Tensor]:
         """Return the batch, and the share of the returns' variance that the critic explains, (num_tasks,)."""
         r = self.rollout
-        num_tasks = self.world.num_tasks
-        task_id = self.world.task_id
-        flat_task_id = task_id.expand(r.rewards.shape).reshape(-1)
+        task_id = self.world.task_id.expand(r.rewards.shape).reshape(-1)
         obs = self.policy.observations(r.obs).flatten(0, 1)
         if self.low_precision:
             obs = obs.bfloat16()  # autocast would make this cast in every mini-batch; the result is the same
-
-        # Several critics give several columns per row; each column is treated as a separate row.
-        def each(x: Tensor) -> Tensor:
-            return x.repeat_interleave(self.num_critics, 1)
-
-        judged = self._in_reward_units(self._critic(obs, flat_task_id), flat_task_id)
-        values = judged.view(len(r.rewards), -1)
-        last_values = self._final_value(r.last_obs, task_id).view(-1)
-        rewards, terminated, ended, valid = map(each, (r.rewards, r.terminated, r.ended, r.valid))
-        element = self._element(task_id).reshape(-1)
-        elements = self.num_critics * num_tasks
-        next_values = estimates.successor_values(values, last_values, ended, r.final_values.flatten(1))
-        gamma = each(self.gamma[None]) if isinstance(self.gamma, Tensor) else self.gamma
-        advantages = estimates.gae(rewards, values, next_values, terminated, ended, gamma, self.config.lam, valid)
-        returns = advantages + values
-        explained = estimates.explained_variance(values, returns, element, elements, valid)
-        self._merge_returns(*estimates.task_moments(returns, element, elements, valid))
-        advantages = estimates.normalise_per_task(advantages, element, elements, valid)
+        values = self._in_reward_units(self._critic(obs, task_id), task_id)  # (B,) or (B, critics)
+        advantages, returns, explained = self._advantages(values.view(len(r.rewards), -1))
         actions = r.actions.flatten(0, 1)
         old_means = r.means.flatten(0, 1)
         batch = Batch(
-            obs=obs, task_id=flat_task_id, actions=actions, old_means=old_means,
+            obs=obs, task_id=task_id, actions=actions, old_means=old_means,
             old_log_probs=gaussian_log_prob(actions, old_means, self.policy.actor.log_std_of(obs)),
-            advantages=advantages.reshape(judged.shape),
-            targets=self.return_stats.normalise(returns.reshape(judged.shape), self._element(flat_task_id)),
+            advantages=advantages.reshape(values.shape),
+            targets=self.return_stats.normalise(returns.reshape(values.shape), self._element(task_id)),
             weights=r.valid.flatten().float()
         )  # fmt: skip
-        return batch, explained.view(-1, num_tasks).mean(0)
+        return batch, explained
+
+    def _advantages(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return normalised advantages and returns of the rollout, and the explained variance, (num_tasks,).
+
+        ``values`` are in units of reward. Values, advantages and returns are (T, N * critics): each critic of an
+        environment has a column of its own. The statistics of returns take in the new returns.
+        """
+        r = self.rollout
+        task_id = self.world.task_id
+
+        def repeated(x: Tensor) -> Tensor:
+            return x.repeat_interleave(self.num_critics, 1)
+
+        rewards = repeated(r.rewards)
+        terminated = repeated(r.terminated)
+        ended = repeated(r.ended)
+        valid = repeated(r.valid)
+        gamma = self.gamma
+        if isinstance(gamma, Tensor):
+            gamma = repeated(gamma[None])
+        last_values = self._final_value(r.last_obs, task_id).view(-1)
+        next_values = estimates.successor_values(values, last_values, ended, r.final_values.flatten(1))
+        advantages = estimates.gae(rewards, values, next_values, terminated, ended, gamma, self.config.lam, valid)
+        returns = advantages + values
+        element = self._element(task_id).reshape(-1)
+        elements = self.num_critics * self.world.num_tasks
+        explained = estimates.explained_variance(values, returns, element, elements, valid)
+        self._merge_returns(*estimates.task_moments(returns, element, elements, valid))
+        advantages = estimates.normalise_per_task(advantages, element, elements, valid)
+        return advantages, returns, explained.view(-1, self.world.num_tasks).mean(0)
 
     def _metrics(self, losses: dict[str, Tensor], explained: Tensor) -> dict[str, float]:
         tensors = dict(losses)

@@ -17,11 +17,11 @@ from bidex_algos.nets.networks import autocast
 from bidex_algos.onpolicy.base import Batch, OnPolicy, OnPolicyConfig
 from bidex_algos.onpolicy.demonstrations import Demonstrations
 from bidex_algos.onpolicy.lessons import Lessons
-from bidex_algos.onpolicy.ppo import NAMES, AdaptiveAdams, PolicyLoss, mini_batches, policy_loss
+from bidex_algos.onpolicy.ppo import NAMES, AdaptiveAdams, PolicyLoss, PPOConfig, mini_batches, policy_loss
 from bidex_algos.rollout import check_samples
 from bidex_meta.training.distributed import sum_gradients, world_size
 from bidex_meta.training.learner import NO_SOURCES, Capability, Parts, Sources, State
-from bidex_meta.utils.validation import Count, Positive, Whole, check_rising
+from bidex_meta.utils.validation import Count, Whole
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.graphs import GraphCache, cuda_graphs
 
@@ -30,18 +30,9 @@ _MAX_GRAD_NORM = 1.0  # gradients are clipped to this norm, separately for actor
 
 
 @dataclass(frozen=True)
-class MTPPOConfig(OnPolicyConfig):
+class MTPPOConfig(PPOConfig, OnPolicyConfig):
     """All options of MT-PPO; the defaults are the preset ``laptop``."""
 
-    num_minibatches: Count = 4  # Mini-batches per epoch; each holds shuffled samples of all environments.
-    epochs: Count = 4  # Passes over the rollout per update.
-    clip: Positive = 0.2  # Distance of the likelihood ratio from 1 at which the objective is clipped.
-    learning_rate: Positive = 3e-4  # Adam's initial step size.
-    desired_kl: Positive = 0.03
-    """Desired KL of the sampling policy from the current policy. The step size is divided by 1.5 if the KL is above
-    twice this value, and multiplied by 1.5 if the KL is below half of it."""
-    learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)  # Bounds of the adaptive step size.
-    critic_learning_rate: Positive | None = 1e-3  # Fixed step size for the critic; None: the same as the actor's.
     gradient_surgery: Balancing = "none"
     """Combination of the tasks' policy gradients. none: sum. pcgrad: sum, after removing from each gradient what points
     against another task's gradient (Yu et al. 2020). cagrad: sum, changed in favour of the task that it would improve
@@ -53,10 +44,6 @@ class MTPPOConfig(OnPolicyConfig):
     critic_first: Whole = 0
     """Number of first environment steps in which only the critic learns. Use this for a policy that begins with a skill
     (cloned, or from --start-from), because updates with an untrained critic would spoil the skill."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_rising(self, self.algo, "learning_rate_range")
 
 
 PRESETS: dict[str, MTPPOConfig] = {

@@ -15,26 +15,33 @@ from bidex_meta.utils.validation import Count, Positive, check_rising
 
 @dataclass(frozen=True)
 class PPOConfig(LearnerConfig):
-    """Options of epochs, clipping and step sizes. If a config has several base classes, these options come last."""
+    """Options of epochs, clipping and adaptive step sizes. With several base classes, these options come last."""
 
     num_minibatches: Count = 4  # Mini-batches per epoch; each holds shuffled samples of all environments.
     epochs: Count = 4  # Passes over the collected data per update.
     clip: Positive = 0.2  # Distance of the likelihood ratio from 1 at which the objective is clipped.
     learning_rate: Positive = 3e-4  # Adam's initial step size.
-    adaptive_learning_rate: bool = True
-    """Divide the step size by 1.5 if the KL exceeds twice desired_kl; multiply it by 1.5 if the KL is below half."""
-    desired_kl: Positive = 0.03  # Desired KL of the sampling policy from the current policy, for adaptive step sizes.
+    desired_kl: Positive = 0.03
+    """Desired KL of the sampling policy from the current policy. The step size is divided by 1.5 if the KL is above
+    twice this value, and multiplied by 1.5 if the KL is below half of it."""
     learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)  # Bounds of the adaptive step size.
     critic_learning_rate: Positive | None = 1e-3  # Fixed step size for the critic; None: the same as the actor's.
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_rising(self, self.algo, "learning_rate_range")
+
+
+@dataclass(frozen=True)
+class OptionalRateConfig(PPOConfig):
+    """PPO's options, and a switch that keeps the step size constant."""
+
+    adaptive_learning_rate: bool = True  # Adapt the step size to desired_kl; if off, the step size is constant.
 
     @property
     def followed_kl(self) -> float | None:
         """Return the KL that the step size follows, or None if the step size stays the same."""
         return self.desired_kl if self.adaptive_learning_rate else None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_rising(self, self.algo, "learning_rate_range")
 
 
 def mini_batches(
