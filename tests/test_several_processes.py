@@ -18,7 +18,7 @@ from bidex_meta.cli import main
 from bidex_meta.cli.run_flags import run_flags
 from bidex_meta.config import config_of
 from bidex_meta.errors import BidexError
-from bidex_meta.experiments import run_config, training
+from bidex_meta.experiments import processes, run_config
 from bidex_meta.runs import RunFolder, read_metrics
 from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.training.distributed import TIMEOUT
@@ -206,8 +206,8 @@ def test_processes_that_disagree_are_refused(monkeypatch: pytest.MonkeyPatch) ->
 
     def agree(step: int | None = None, **other: object) -> AnyConfig:
         everyone = SimpleNamespace(share=lambda mine: [mine, (replace(config, **other), step)])
-        monkeypatch.setattr(training, "distributed", everyone)
-        return training._agree(config, None)
+        monkeypatch.setattr(processes, "distributed", everyone)
+        return processes.agree(config, None)
 
     assert agree(threads=99).threads == 1
     with pytest.raises(BidexError, match=r"Process 1 has steps = 5, not .* Start all with the same flags"):

@@ -5,7 +5,6 @@ If torchrun started several processes, each has its own world and learner. Only 
 """
 
 import contextlib
-import logging
 import math
 import signal
 from collections.abc import Callable, Mapping
@@ -22,23 +21,20 @@ from bidex_meta.errors import BidexError
 from bidex_meta.experiments import metatest, run_data, run_recording, run_teachers, watching
 from bidex_meta.experiments.learners import LearnerKind, learner_kind
 from bidex_meta.experiments.policies import fitting, load_checkpoint, say_other_classes, say_other_rules
+from bidex_meta.experiments.processes import Checkpoint, agree, report_loss
 from bidex_meta.experiments.run_config import check, preset_reason, resolve, resumed
 from bidex_meta.runs import Recorder, RunFolder, mend, training_seconds
 from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.folder import AnyConfig, check_new, new_folder_name
 from bidex_meta.training import distributed, runner
 from bidex_meta.training.distributed import together
-from bidex_meta.training.launch import launch, resume_command, say
+from bidex_meta.training.launch import launch, say
 from bidex_meta.training.learner import NO_SOURCES, Capability, Learner, Sources
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.threads import set_up_torch, torch_settings_kept
 from bidex_meta.worlds import Worlds, open_worlds
-
-_LOG = logging.getLogger("bidex_meta")
-
-Checkpoint = tuple[Json, int]  # a state and its environment steps
 
 
 @dataclass(frozen=True)
@@ -92,23 +88,24 @@ def train(
     distributed.init_from_environment()
     folder = None
     try:
-        with contextlib.ExitStack() as held:  # holds the lock of the run's folder
+        with contextlib.ExitStack() as locks:
             # The caller may have switched gradients off.
-            held.enter_context(torch.inference_mode(False))
-            held.enter_context(torch.enable_grad())
-            old = together(lambda: None if resume is None else _opened(resume, run_dir))
-            resolved = together(lambda: _checked(config, old))
-            new = None if run_dir is None else Path(run_dir)
-            together(lambda: _lock(resolved, old, new, held))
-            loaded = together(lambda: old.checkpoints.load() if old else None)
-            agreed = _agree(resolved, loaded)
-            run = _begin(agreed, old, new, loaded, held)
+            locks.enter_context(torch.inference_mode(False))
+            locks.enter_context(torch.enable_grad())
+            resumed_run = together(lambda: None if resume is None else _opened(resume, run_dir))
+            own_config = together(lambda: _checked(config, resumed_run))
+            new_path = None if run_dir is None else Path(run_dir)
+            together(lambda: _lock(resumed_run, locks))
+            together(lambda: _check_start(own_config, resumed_run, new_path))
+            loaded = together(lambda: resumed_run.checkpoints.load() if resumed_run else None)
+            agreed = agree(own_config, loaded)
+            run = _begin(agreed, resumed_run, new_path, loaded, locks)
             folder = run.folder
             stopped = _train(run, agreed, loaded, on_event, show_progress)
             distributed.shut_down()
             run.world.close()
     except distributed.LostProcess as loss:
-        _report_loss(loss, folder)
+        report_loss(loss, folder)
         raise
     if stopped:
         raise Stopped(folder, run.learner.env_steps, stopped)
@@ -135,71 +132,49 @@ def _opened(resume: RunFolder | str | Path, run_dir: object) -> RunFolder:
     return RunFolder.open(resume.path if isinstance(resume, RunFolder) else resume)
 
 
-def _checked(config: AnyConfig | None, old: RunFolder | None) -> AnyConfig:
-    if config is None and old is None:
+def _checked(config: AnyConfig | None, resumed_run: RunFolder | None) -> AnyConfig:
+    if config is None and resumed_run is None:
         raise BidexError('Expected a config or a run to resume, got neither. Pass RunConfig(suite="MT4-v2").')
-    if old is None:
+    if resumed_run is None:
         assert config is not None
         config = resolve(config)
     else:
-        config = resolve(old.config() if config is None else config, str(old.config_path))
-        config = resumed(old, config)
+        config = resolve(resumed_run.config() if config is None else config, str(resumed_run.config_path))
+        config = resumed(resumed_run, config)
     check(config)
     return config
 
 
-def _lock(config: AnyConfig, old: RunFolder | None, new: Path | None, held: contextlib.ExitStack) -> None:
-    """Lock the run's folder, and raise an error at once for configs that would fail in the middle of training."""
-    kind = learner_kind(config.algo, config.task)
+def _lock(resumed_run: RunFolder | None, locks: contextlib.ExitStack) -> None:
+    """Lock the folder of a resumed run; a new run's folder is locked when it is made."""
+    if launch().rank == 0 and resumed_run is not None:
+        resumed_run.check_own()
+        locks.enter_context(resumed_run.locked())
+
+
+def _check_start(config: AnyConfig, resumed_run: RunFolder | None, new_path: Path | None) -> None:
+    """Raise BidexError at once for what would fail in the middle of training, or only after the world is built."""
     worlds = open_worlds(config.to_json())
     if launch().rank == 0:
-        if old is not None:
-            old.check_own()
-            held.enter_context(old.locked())
-        else:
+        if resumed_run is None:
             # The check uses a name that no other run has, even if another run begins in the same second.
             name = new_folder_name(config)
-            check_new(new or name.with_name(f"{name.name}_0"))
+            check_new(new_path or name.with_name(f"{name.name}_0"))
         watching.check(config, worlds)
-    if Capability.ADAPTS in kind.capabilities:
+    if Capability.ADAPTS in learner_kind(config.algo, config.task).capabilities:
         metatest.check_worlds(worlds, config.algo)
-    if old is None and config.start_from is not None:
+    if resumed_run is None and config.start_from is not None:
         start = RunFolder.open(Path(config.start_from))
         if start.checkpoints.newest_step() is None:
             load_checkpoint(start)  # raises BidexError if the run has no checkpoint
 
 
-def _agree(config: AnyConfig, loaded: Checkpoint | None) -> AnyConfig:
-    """Return the config of process 0, which all processes then use.
-
-    Raises BidexError if a process has another config (apart from the number of threads), or sees another checkpoint.
-    """
-    everyone = distributed.share((config, loaded and loaded[1]))
-    first, step = everyone[0]
-
-    def refuse_others() -> None:
-        here = first.flat()
-        for number, (other, other_step) in enumerate(everyone):
-            there = other.flat()
-            # Machines may differ in cores, so the run keeps the number of threads of process 0.
-            for name in here.keys() - {"threads"}:
-                if here[name] != there.get(name):
-                    raise BidexError(
-                        f"Process {number} has {name} = {there.get(name)}, not {here[name]} as process 0. Start all "
-                        "with the same flags."
-                    )
-            if other_step != step:
-                raise BidexError(
-                    f"Process {number} finds a checkpoint at {other_step} steps, process 0 at {step}. The run folder "
-                    "must be one that all machines see."
-                )
-
-    together(refuse_others)
-    return first
-
-
 def _begin(
-    config: AnyConfig, old: RunFolder | None, new: Path | None, loaded: Checkpoint | None, held: contextlib.ExitStack
+    config: AnyConfig,
+    resumed_run: RunFolder | None,
+    new_path: Path | None,
+    loaded: Checkpoint | None,
+    locks: contextlib.ExitStack,
 ) -> _Run:
     """Make the world, the learner and the folder; all processes use the folder of process 0."""
     # Sums depend on how torch splits them over threads: a resumed run must use the number it began with.
@@ -217,26 +192,26 @@ def _begin(
     plain_world = together(lambda: worlds.world("train", config.num_envs, autoreset))
     collector = None
     if config.record:
-        if old:
-            place = old.path
+        if resumed_run:
+            place = resumed_run.path
         else:
-            place = new or new_folder_name(config)
+            place = new_path or new_folder_name(config)
         collector = together(lambda: run_recording.recorded(config, place, plain_world))
     world: VectorWorld = plain_world if collector is None else collector
     note("Making the learner")
-    sources = together(lambda: _sources(config, worlds, world, old))
+    sources = together(lambda: _sources(config, worlds, world, resumed_run))
     learner = together(lambda: _make_learner(config, kind, worlds, world, sources, fresh=loaded is None))
     identity: Json = dict(worlds.identity())
     if sources.teachers is not None:
         identity["teacher_steps"] = run_teachers.steps_of(sources.teachers)
-    own = together(lambda: old or (_new_folder(config, new, identity, held) if launch().rank == 0 else None))
-    path = distributed.share(own and own.path)[0]
-    assert path is not None
-    folder = RunFolder(path)
+    if resumed_run is None:
+        folder = _new_folder(config, new_path, identity, locks)
+    else:
+        folder = resumed_run
     say(f"Run folder: {folder.path}")
     if collector is not None:
         together(lambda: run_recording.begin(collector, folder.path, fresh=loaded is None))
-    return _Run(folder, kind, worlds, world, collector, learner, is_resumed=old is not None)
+    return _Run(folder, kind, worlds, world, collector, learner, is_resumed=resumed_run is not None)
 
 
 def _make_learner(
@@ -264,10 +239,10 @@ def _make_learner(
     return learner
 
 
-def _sources(config: AnyConfig, worlds: Worlds, world: VectorWorld, old: RunFolder | None) -> Sources:
+def _sources(config: AnyConfig, worlds: Worlds, world: VectorWorld, resumed_run: RunFolder | None) -> Sources:
     """Return the data, demonstrations and teachers that a config names.
 
-    Raises BidexError if a teacher has changed since the resumed run ``old`` began.
+    Raises BidexError if a teacher has changed since the resumed run ``resumed_run`` began.
     """
     data = None
     demonstrations = None
@@ -279,15 +254,24 @@ def _sources(config: AnyConfig, worlds: Worlds, world: VectorWorld, old: RunFold
         demonstrations = join(found, world, every=False)
     if config.teacher:
         teachers = run_teachers.teachers_of(config, worlds, world)
-        if old is not None:
-            run_teachers.check_same(old, teachers)
+        if resumed_run is not None:
+            run_teachers.check_same(resumed_run, teachers)
     return Sources(data, demonstrations, teachers)
 
 
-def _new_folder(config: AnyConfig, path: Path | None, identity: Json, held: contextlib.ExitStack) -> RunFolder:
-    folder = RunFolder.create(config, path, identity=identity)
-    held.enter_context(folder.locked())
-    return folder
+def _new_folder(config: AnyConfig, path: Path | None, identity: Json, locks: contextlib.ExitStack) -> RunFolder:
+    """Return the run's folder, which process 0 makes and locks."""
+
+    def made() -> Path | None:
+        if launch().rank > 0:
+            return None
+        folder = RunFolder.create(config, path, identity=identity)
+        locks.enter_context(folder.locked())
+        return folder.path
+
+    first = distributed.share(together(made))[0]
+    assert first is not None
+    return RunFolder(first)
 
 
 def _train(
@@ -297,7 +281,7 @@ def _train(
     folder = run.folder
     learner = run.learner
     waits = distributed.LostProcess("this one was asked to stop and waits for it")
-    distributed.on_loss(lambda: _report_loss(waits, folder))
+    distributed.on_loss(lambda: report_loss(waits, folder))
     resume_step = None
     if loaded is not None:
         state, resume_step = loaded
@@ -388,28 +372,3 @@ def _early_end(config: AnyConfig) -> Callable[[Mapping[str, float]], bool] | Non
         return tag is not None
 
     return reached
-
-
-def _report_loss(loss: Exception, folder: RunFolder | None = None) -> None:
-    """Log that another process is gone, and which checkpoint is left; only the first process that notices logs this."""
-    missing = distributed.report_loss()
-    if missing is None:
-        return
-    count = launch().count
-    which = ", ".join(map(str, missing))
-    if which:
-        gone = f"process {which} of {count} is gone or stuck"
-    else:
-        gone = f"one of {count} processes has ended"
-    left = "Training had not begun."
-    if folder is not None:
-        if folder.checkpoints_path.is_dir():
-            step = folder.checkpoints.newest_step()
-        else:
-            step = None
-        if step is None:
-            saved = "There is no checkpoint yet"
-        else:
-            saved = f"The last checkpoint is at {step:,} steps"
-        left = f"{saved}, in {folder.checkpoints_path}. Continue: {resume_command(folder.path, count)}"
-    _LOG.error("%s (%s). %s", gone, loss, left)
