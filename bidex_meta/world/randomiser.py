@@ -141,8 +141,12 @@ class _Models:
             self._fields = engine.expand(rules[0])
         else:
             self._fields = {}
-        self._rules = [{name: rule[name] for name in self._fields} for rule in rules]
-        self._bases = [{n: f[m.engine_rows.start].clone() for n, f in self._fields.items()} for m in members]
+        self._rules = []
+        self._bases = []
+        for member, rule in zip(members, rules, strict=True):
+            first_row = member.engine_rows.start
+            self._rules.append({name: rule[name] for name in self._fields})
+            self._bases.append({name: field[first_row].clone() for name, field in self._fields.items()})
         self._first = [int(object_bodies(member.scene.model).argmax()) for member in members]
         self._masses = []
         for member, first in zip(members, self._first, strict=True):

@@ -108,6 +108,8 @@ class World(BatchedWorld):
         self.success_at_end = any(slot.task_class.rules.success == "at-end" for slot in self.slots)
         self.points = config.points
         self.hides_goals = config.observation == "masked"
+        # The order matters: groups take the pools, the width of an observation comes from the groups, parts need both,
+        # and randomisation and draws need the parts.
         groups = build_groups(self.slots, self.slot_env_ids, make_engine)
         self._avoids_syncs = groups[0].engine.avoids_syncs
         self._describe_observations(groups)

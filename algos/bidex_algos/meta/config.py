@@ -68,14 +68,12 @@ class MetaConfig(LearnerConfig):
         return 4 * num_envs * width * steps + network_bytes(self.hidden, width, 2)
 
 
+@dataclass(frozen=True)
 class OuterConfig(MetaConfig):
-    """Options of the outer step.
+    """Options of the outer step."""
 
-    Each learner's config declares these options again, to define the order of its flags.
-    """
-
-    outer_learning_rate: Positive  # Adam's step size for the meta-parameters.
-    max_grad_norm: Positive  # Meta-gradients are clipped to this norm.
+    outer_learning_rate: Positive = 1e-3  # Adam's step size for the meta-parameters, at the beginning.
+    max_grad_norm: Positive = 1.0  # Meta-gradients are clipped to this norm before a step of Adam.
 
 
 # These values are from Table 48 of the Bi-DexHands appendix (ProMP), except the outer step. Rollouts there are eight

@@ -24,8 +24,6 @@ class MAMLConfig(OuterConfig):
     """All options of MAML; the defaults are the preset ``laptop``."""
 
     outer: Literal["trpo", "adam"] = "trpo"  # Outer step: a trust-region step as in the paper, or a step of Adam.
-    outer_learning_rate: Positive = 1e-3  # Adam's step size for the meta-parameters.
-    max_grad_norm: Positive = 1.0  # Meta-gradients are clipped to this norm before a step of Adam.
     max_kl: Positive = 0.01  # Bound of the mean KL between sampling and adapted policies in a trust-region step.
     damping: NonNegative = 1e-2  # Added to the diagonal of the Fisher matrix.
     cg_iterations: Count = 10  # Conjugate-gradient iterations.

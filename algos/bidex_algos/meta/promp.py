@@ -23,7 +23,6 @@ class ProMPConfig(OuterConfig):
     """All options of ProMP; the defaults are the preset ``laptop``."""
 
     outer_epochs: Count = 5  # Outer steps on one meta-batch; the inner steps are computed again for each outer step.
-    outer_learning_rate: Positive = 1e-3  # Initial step size of Adam for the meta-parameters.
     desired_kl: Positive | None = None
     """Divide the outer step size by 1.5 if the KL of the adapted policies from the sampling policies exceeds twice this
     value; multiply it by 1.5 if the KL is below half of it. None: the step size is fixed. A fixed step may be far too
@@ -31,7 +30,6 @@ class ProMPConfig(OuterConfig):
     outer_learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)  # Bounds of the step size that desired_kl sets.
     clip: Positive = 0.3  # Distance of the likelihood ratio after adaptation from 1 at which the objective is clipped.
     kl_weight: NonNegative = 5e-4  # Factor of the KL from the policies that sampled before each inner step.
-    max_grad_norm: Positive = 1.0  # Meta-gradients are clipped to this norm.
 
     def __post_init__(self) -> None:
         super().__post_init__()
