@@ -11,6 +11,7 @@ from bidex_meta.errors import BidexError, one_line, shortened, unknown_name
 from bidex_meta.experiments import run_data, run_teachers
 from bidex_meta.experiments.conditions import check_worlds_of
 from bidex_meta.experiments.learners import choose_preset, learner_kind, resolve_device
+from bidex_meta.experiments.metatest import check_worlds
 from bidex_meta.runs.folder import AnyConfig, RunFolder
 from bidex_meta.training.launch import launch, resume_command
 from bidex_meta.training.learner import Capability, LearnerConfig
@@ -89,6 +90,8 @@ def check(config: AnyConfig, with_memory: bool = True) -> None:
         raise BidexError(
             "--stop-at-score is measured in evaluations during training. Add for example --evaluate-every 50."
         )
+    if Capability.ADAPTS in kind.capabilities:
+        check_worlds(worlds, config.algo)
     if config.record:
         part_files.hdf5()  # raises BidexError if h5py is not installed
     if config.stops_by_training and Capability.OFFLINE in kind.capabilities:

@@ -10,14 +10,12 @@ from typing import Literal, NamedTuple
 from bidex_meta.errors import BidexError, one_line
 from bidex_meta.experiments import metatest
 from bidex_meta.experiments.evaluating import FinalEvaluation
-from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.experiments.run_config import check, resolve
 from bidex_meta.experiments.sweep_plan import PlannedRun, SweepPlan
 from bidex_meta.runs.evaluations import Evaluated, MetaTestEvaluation, SplitSummary
 from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.runs.metrics import last_rows
 from bidex_meta.suite import OTHERS
-from bidex_meta.training.learner import Capability
 from bidex_meta.utils.files import JsonObject, absolute, exists, is_file
 from bidex_meta.worlds import Worlds, open_worlds
 
@@ -66,8 +64,6 @@ def states_of(plan: SweepPlan) -> list[State]:
 def _resolved(run: PlannedRun) -> AnyConfig:
     config = resolve(run.given)
     check(config)
-    if Capability.ADAPTS in learner_kind(config.algo, config.task).capabilities:
-        metatest.check_worlds(open_worlds(config.to_json()), config.algo)
     run.final.check(config)
     return config
 

@@ -18,7 +18,7 @@ import torch
 from bidex_meta.data.collector import RunCollector
 from bidex_meta.data.joined import join
 from bidex_meta.errors import BidexError
-from bidex_meta.experiments import metatest, run_data, run_recording, run_teachers, watching
+from bidex_meta.experiments import run_data, run_recording, run_teachers, watching
 from bidex_meta.experiments.learners import LearnerKind, learner_kind
 from bidex_meta.experiments.policies import fitting, load_checkpoint, say_other_classes, say_other_rules
 from bidex_meta.experiments.processes import Checkpoint, agree, report_loss
@@ -29,7 +29,7 @@ from bidex_meta.runs.folder import AnyConfig, check_new, new_folder_name
 from bidex_meta.training import distributed, runner
 from bidex_meta.training.distributed import together
 from bidex_meta.training.launch import launch, say
-from bidex_meta.training.learner import NO_SOURCES, Capability, Learner, Sources
+from bidex_meta.training.learner import NO_SOURCES, Learner, Sources
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.contract import VectorWorld
@@ -154,15 +154,12 @@ def _lock(resumed_run: RunFolder | None, locks: contextlib.ExitStack) -> None:
 
 def _check_start(config: AnyConfig, resumed_run: RunFolder | None, new_path: Path | None) -> None:
     """Raise BidexError at once for what would fail in the middle of training, or only after the world is built."""
-    worlds = open_worlds(config.to_json())
     if launch().rank == 0:
         if resumed_run is None:
             # The check uses a name that no other run has, even if another run begins in the same second.
             name = new_folder_name(config)
             check_new(new_path or name.with_name(f"{name.name}_0"))
-        watching.check(config, worlds)
-    if Capability.ADAPTS in learner_kind(config.algo, config.task).capabilities:
-        metatest.check_worlds(worlds, config.algo)
+        watching.check(config, open_worlds(config.to_json()))
     if resumed_run is None and config.start_from is not None:
         start = RunFolder.open(Path(config.start_from))
         if start.checkpoints.newest_step() is None:
