@@ -68,7 +68,7 @@ FinalValue = Callable[[Tensor, Tensor], Tensor]
 
 
 class Rollout:
-    """Transitions of T steps in N environments, preallocated and overwritten by each :func:`collect`."""
+    """Transitions of T steps in N environments, preallocated and overwritten by each :func:`collect_rollout`."""
 
     def __init__(
         self, steps: int, num_envs: int, observations: int, actions: int, device: torch.device, critics: int = 1
@@ -91,7 +91,7 @@ class Rollout:
 
 
 @torch.no_grad()
-def collect(
+def collect_rollout(
     world: VectorWorld, rollout: Rollout, obs: Tensor, sample: Sampler, final_value: FinalValue,
     episodes: EpisodeStatistics
 ) -> Tensor:  # fmt: skip

@@ -375,9 +375,9 @@ def _played(worlds: Worlds, policy: Agent, split: str, size: Options, random: bo
     note(f"Building the world of {worlds.name}")
     world = worlds.world(split, size.num_envs)
     protocol = worlds.protocol(split, size.episodes, size.seed)
-    found = worlds.judge(policy, world, protocol)
+    found = worlds.evaluate(policy, world, protocol)
     if random:
-        other = worlds.judge(RandomAgent(world.action_space), world, protocol)
+        other = worlds.evaluate(RandomAgent(world.action_space), world, protocol)
     else:
         other = None
     world.close()

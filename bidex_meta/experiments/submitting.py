@@ -244,7 +244,7 @@ class _Played:
 def judged(run: SubmittedRun, worlds: Worlds, episodes: int, seed: int) -> _Played:
     """Play the episodes of a policy that does not adapt."""
     world = worlds.world("train")
-    found = worlds.judge(
+    found = worlds.evaluate(
         policy_of(run.folder, run.state, worlds.device), world, worlds.protocol("train", episodes, seed)
     )
     world.close()

@@ -222,7 +222,7 @@ def _replayed(
     """Repeat a recorded evaluation of a policy that does not adapt, on the tasks of ``worlds``."""
     world = worlds.world(recorded.split, num_envs)
     protocol = worlds.protocol(recorded.split, recorded.policy.episodes_per_task, seed)
-    found = worlds.judge(policy, world, protocol)
+    found = worlds.evaluate(policy, world, protocol)
     world.close()
     return found.summary()
 

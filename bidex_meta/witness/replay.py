@@ -16,7 +16,7 @@ from bidex_meta.rules import plain_name
 from bidex_meta.witness.controller import Actions, HandActions, HandController
 from bidex_meta.witness.store import Witness
 from bidex_meta.world import Slot, World, WorldConfig
-from bidex_meta.world.part import judge
+from bidex_meta.world.part import judgement_of
 
 # Witnesses solve task 0 of each class of this suite and seed.
 SUITE = "MT20"
@@ -111,7 +111,7 @@ class Simulator:
         for action in actions:
             self._part.step(action, None)
             (_, _, state), *_ = self._part.states(self._world.task_index)
-            transition = judge(self._part.group.members[0].scene.task, state)
+            transition = judgement_of(self._part.group.members[0].scene.task, state)
             alive &= ~self._part.unstable()
             terms = torch.stack(list(transition.terms.values()))
             rewards.append(torch.where(alive, transition.reward, 0.0))

@@ -9,7 +9,7 @@ from bidex_meta.errors import BidexError, shortened
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.utils.maths import indices
 from bidex_meta.world.groups import Member, Slot
-from bidex_meta.world.part import Part, PartedWorld, judge
+from bidex_meta.world.part import Part, PartedWorld, judgement_of
 
 
 class HiddenParts:
@@ -93,7 +93,7 @@ class HiddenParts:
         rewards = torch.zeros(given.shape[:2], device=world.device)
         for part in world.parts:
             for member, state in self._states(world, part, given):
-                paid = judge(member.scene.task, state).reward * world.slots[member.slot].reward_scale
+                paid = judgement_of(member.scene.task, state).reward * world.slots[member.slot].reward_scale
                 rewards[:, member.env_ids] = paid.float().unflatten(0, (len(given), -1))
         return rewards.view(goals.shape[:-1])
 

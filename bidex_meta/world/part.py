@@ -48,7 +48,7 @@ class Part:
         self.engine_rows[group.env_ids] = torch.arange(self._engine.num, device=self._engine.device)
         self.substeps = round(1.0 / (CONTROL_RATE * group.members[0].scene.model.opt.timestep))
         """Engine steps per control step."""
-        self.looks = self._engine.device.type == "cpu"
+        self.checks_numbers = self._engine.device.type == "cpu"
         """True if every step checks the numbers of the user's own classes; on a GPU that would stall the step."""
         self._controls = Controls(group)
         self._start = torch.stack([torch.from_numpy(m.scene.start_qpos) for m in group.members]).to(self._engine.qpos)
@@ -214,7 +214,7 @@ class Part:
             blocks = task.observe(state)
             if not goals:
                 blocks = {name: block for name, block in blocks.items() if name not in self._goals[member.slot]}
-            if self.looks:
+            if self.checks_numbers:
                 if rows is None:
                     engine_rows = member.engine_rows
                 else:
@@ -267,7 +267,7 @@ class Part:
             else:
                 frozen = self.frozen(i, task_index[where])
             task.begin(own, frozen, views)
-            if self.looks:
+            if self.checks_numbers:
                 check_numbers(task, "start", views)
         return qpos
 
@@ -326,7 +326,7 @@ class Judgement(NamedTuple):
     failed: Tensor
 
 
-def judge(task: TaskClass, state: TaskState) -> Judgement:
+def judgement_of(task: TaskClass, state: TaskState) -> Judgement:
     """Return reward, success and failure of the step just made."""
     terms = task.rewards(state)
     values = list(terms.values())
@@ -337,7 +337,9 @@ def judge(task: TaskClass, state: TaskState) -> Judgement:
     return Judgement(terms, reward, task.solved_in(state), task.failed(state))
 
 
-def collect(parts: Sequence[Part], task_index: Tensor, action: Tensor, width: int, together: Together) -> Transition:
+def read_transition(
+    parts: Sequence[Part], task_index: Tensor, action: Tensor, width: int, together: Together
+) -> Transition:
     """Compute rewards, success, failure and observations of all environments after a step.
 
     ``together`` runs one job per part. ``task_index`` (n,) and ``action`` (n, a) are those of the step. ``width`` is
@@ -361,8 +363,8 @@ def collect(parts: Sequence[Part], task_index: Tensor, action: Tensor, width: in
         broke = part.unstable()
         for member, where, state in states:
             env_ids = member.env_ids
-            judged = judge(member.scene.task, state)
-            if part.looks:
+            judged = judgement_of(member.scene.task, state)
+            if part.checks_numbers:
                 check_numbers(member.scene.task, "reward_terms", judged.terms, part.unstable, member.engine_rows)
             reward[env_ids] = judged.reward
             success[env_ids] = judged.success

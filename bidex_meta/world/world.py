@@ -3,8 +3,9 @@
 An observation is made in these steps:
 
 1. ``Part.advance``: the engine steps and fills ``sensordata``.
-2. ``part.collect`` calls ``Part.observe`` for each part: ``Observer`` gathers and scales sensors, ``TaskClass.observe``
-   fills in the goal blocks (in a world that hides goals they stay 0), a ``DepthSensor`` adds a point cloud.
+2. ``part.read_transition`` calls ``Part.observe`` for each part: ``Observer`` gathers and scales sensors,
+   ``TaskClass.observe`` fills in the goal blocks (in a world that hides goals they stay 0), a ``DepthSensor`` adds a
+   point cloud.
 3. ``World._finish_step`` adds noise (``_noisy``) and the task id (``_write_ids``).
 4. ``BatchedWorld._finish`` keeps the old observation where physics broke; ``BatchedWorld.step`` returns a copy.
 5. In a learner, ``ObservationNormaliser`` scales it by running statistics, and the actor reads it.
@@ -39,7 +40,7 @@ from bidex_meta.world.graphs import CapturedStepper, SideBySide, cuda_graphs
 from bidex_meta.world.groups import Group, Slot, build_groups, sights, with_pool, with_pools
 from bidex_meta.world.hidden_parts import HiddenParts
 from bidex_meta.world.observations import observation_groups
-from bidex_meta.world.part import Part, base_rotations, collect
+from bidex_meta.world.part import Part, base_rotations, read_transition
 from bidex_meta.world.random import env_keys, uniform
 from bidex_meta.world.randomiser import Randomiser, deviations
 from bidex_meta.world.rendering import Painter
@@ -270,7 +271,9 @@ class World(BatchedWorld):
 
     def _finish_step(self, active: Tensor, broken: Tensor) -> Outcome:
         """Observe the new state and finish the step."""
-        transition = collect(self.parts, self.task_index, self._action, self.observation_size, self._side_by_side.run)
+        transition = read_transition(
+            self.parts, self.task_index, self._action, self.observation_size, self._side_by_side.run
+        )
         obs = self._noisy(transition.obs, self.episodes.elapsed + 1)
         self._write_ids(obs)
         return self._finish(active, broken, transition._replace(obs=obs))

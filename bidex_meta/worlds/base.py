@@ -192,7 +192,7 @@ class Worlds(ABC):
         """Return the protocol of an evaluation with ``episodes`` (None: ``default_episodes``) per task of a split."""
         return Protocol(split, seed, episodes_per_task=self.default_episodes if episodes is None else episodes)
 
-    def judge(self, agent: "Agent", world: "PooledWorld", protocol: Protocol) -> Evaluation:
+    def evaluate(self, agent: "Agent", world: "PooledWorld", protocol: Protocol) -> Evaluation:
         """Evaluate a policy on all tasks of a world (mode DISABLED)."""
         from bidex_meta.evaluation.play import evaluate
 

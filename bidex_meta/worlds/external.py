@@ -103,8 +103,8 @@ class MetaWorldSuite(Foreign):
         """See ``Worlds``."""
         return _TRAINING_SIZE * len(self.class_names), _TRAINING_STEPS * len(self.class_names)
 
-    def judge(self, agent: "Agent", world: "PooledWorld", protocol: Protocol) -> Evaluation:
-        """Evaluate a policy on the fifty tasks of each class, as ``Worlds.judge``.
+    def evaluate(self, agent: "Agent", world: "PooledWorld", protocol: Protocol) -> Evaluation:
+        """Evaluate a policy on the fifty tasks of each class, as ``Worlds.evaluate``.
 
         The world's environments play as many tasks at a time as there are environments per class.
         """

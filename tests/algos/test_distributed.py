@@ -26,7 +26,7 @@ from bidex_algos.offpolicy.flashsac import FlashSAC, FlashSACConfig
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
-from bidex_algos.rollout import collect
+from bidex_algos.rollout import collect_rollout
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import ZeroAgent
 from bidex_meta.experiments.learners import learner_kind
@@ -113,7 +113,7 @@ def one_update(rank: int, config: Any) -> Callable[[], dict[str, Any]]:
     whole = make_learner(toy(2 * ROWS, BROKEN), config)
     first, _ = whole.world.reset(seed=0)
     whole.policy.observations.update(first)
-    collect(whole.world, whole.rollout, first, whole._sample, whole._final_value, whole.episodes)
+    collect_rollout(whole.world, whole.rollout, first, whole._sample, whole._final_value, whole.episodes)
     expected = update(in_double(whole))
 
     def in_two() -> dict[str, Any]:

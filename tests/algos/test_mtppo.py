@@ -11,7 +11,7 @@ from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import GaussianActor, gaussian_kl
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
-from bidex_algos.rollout import collect
+from bidex_algos.rollout import collect_rollout
 from bidex_algos.trust_region import fisher_product, flatten
 from bidex_meta.world.contract import plain_groups
 from tests.algos.problems import trained
@@ -63,7 +63,7 @@ def ready(config: MTTRPOConfig, world: ToyWorld) -> MTTRPO:
     learner = MTTRPO(world, config, seed=0)
     learner.iterate()
     assert learner.obs is not None
-    collect(world, learner.rollout, learner.obs, learner._sample, learner._final_value, learner.episodes)
+    collect_rollout(world, learner.rollout, learner.obs, learner._sample, learner._final_value, learner.episodes)
     return learner
 
 

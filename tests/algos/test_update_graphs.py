@@ -87,7 +87,9 @@ def test_collecting_and_learning_look_at_no_number(masked, monkeypatch: pytest.M
     obs = learner.obs
     assert obs is not None
     with no_looks(monkeypatch):
-        rollout.collect(learner.world, learner.rollout, obs, learner._sample, learner._final_value, learner.episodes)
+        rollout.collect_rollout(
+            learner.world, learner.rollout, obs, learner._sample, learner._final_value, learner.episodes
+        )
         learner._update(learner._prepare()[0])
         learner.policy.observations.update(learner.rollout.obs)
 

@@ -104,7 +104,7 @@ def main() -> None:
     world, tested = source.world("train", len(source.tasks("train")), "SAME_STEP"), source.world()
 
     def judge(agent: Any) -> float:
-        classes = source.judge(agent, tested, source.protocol("train", flags.episodes)).classes.values()
+        classes = source.evaluate(agent, tested, source.protocol("train", flags.episodes)).classes.values()
         return float(np.mean([each.mean_return if each.score is None else each.score for each in classes]))
 
     found = against(join([dataset], world), world, judge, flags.python, flags.updates, flags.seeds)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.tasks import registry
-from bidex_meta.world.part import judge
+from bidex_meta.world.part import judgement_of
 from tests.tasks import wide
 from tests.tasks.formulas import FORMULAS
 from tests.tasks.worlds import Lens, engine_of, scene_of, set_pose, task_of, world_of
@@ -36,7 +36,7 @@ def test_the_reward_is_one_where_solved_and_at_most_nine_tenths_elsewhere(name: 
                 set_pose(world, row, body, values)
         engine.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
         ((member, _, state),) = part.states(world.task_index)
-        judged = judge(member.scene.task, state)
+        judged = judgement_of(member.scene.task, state)
         check_range(judged.reward, judged.success)
         count += int(judged.success.sum())
         for row in range(i % 3, ROWS, 3):

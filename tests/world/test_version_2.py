@@ -13,7 +13,7 @@ from bidex_meta.tasks import registry
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.world import World, WorldConfig
 from bidex_meta.world.agent_views import agent_views
-from bidex_meta.world.part import judge
+from bidex_meta.world.part import judgement_of
 from tests.data.test_commands import recorded
 from tests.tasks.worlds import MOVING, engine_of, slot
 from tests.world.play import suite_world
@@ -109,5 +109,5 @@ def test_no_start_tells_the_task_and_placements_enter_no_reward(name: str) -> No
     draws = 2.0 * torch.rand(6, max(1, task.episode_space.size), generator=torch.Generator().manual_seed(0)) - 1.0
     drawn = task.frozen(torch.from_numpy(pools[0]), draws)
     other = TaskState(engine_of(worlds[0]).sensordata, member.scene.sensors, drawn)
-    assert torch.equal(judge(task, other).reward, judge(task, state).reward)
-    assert torch.equal(judge(task, other).success, judge(task, state).success)
+    assert torch.equal(judgement_of(task, other).reward, judgement_of(task, state).reward)
+    assert torch.equal(judgement_of(task, other).success, judgement_of(task, state).success)

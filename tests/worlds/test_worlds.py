@@ -98,7 +98,7 @@ def test_references_are_of_moving_bases() -> None:
 def test_a_policy_is_judged_on_every_task_of_its_slots() -> None:
     source = open_worlds({"task": "Switch", "threads": 1})
     world = source.world()
-    found = source.judge(ZeroAgent(world.action_space), world, source.protocol("train", 1, 3))
+    found = source.evaluate(ZeroAgent(world.action_space), world, source.protocol("train", 1, 3))
     world.close()
     assert len(found.classes["Switch"].returns) == 50 and found.classes["Switch"].reference is not None
 

@@ -15,7 +15,7 @@ from bidex_algos.nets.architecture import Architecture, check_networks, network_
 from bidex_algos.nets.networks import Activation, Autocast, Layers, autocast, gaussian_log_prob
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.policy import GaussianPolicy, gaussian_policy, of_head
-from bidex_algos.rollout import EpisodeStatistics, Rollout, collect
+from bidex_algos.rollout import EpisodeStatistics, Rollout, collect_rollout
 from bidex_meta.training.distributed import all_sum, world_size
 from bidex_meta.training.learner import Capability, LearnerConfig, Parts, State
 from bidex_meta.utils.validation import Count, Fraction, Positive, Widths, check_rising
@@ -115,7 +115,9 @@ class OnPolicy(Learner):
         with self._collecting():
             if self.obs is None:
                 self.obs = self._first_observations()
-            self.obs = collect(self.world, self.rollout, self.obs, self._sample, self._final_value, self.episodes)
+            self.obs = collect_rollout(
+                self.world, self.rollout, self.obs, self._sample, self._final_value, self.episodes
+            )
         # Step 2: compute advantages and the critic's targets.
         batch, explained = self._prepare()
         # Steps 3 to 6: learn from them.
