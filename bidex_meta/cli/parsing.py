@@ -97,6 +97,8 @@ class LookFlags:
         """Return the name of the policy, given as RUN or by --policy."""
         if self.run is None:
             return self.policy
+        if str(self.run) in ("zero", "random"):  # a folder may have the name of a policy
+            return str(self.run.absolute())
         return str(self.run)
 
 

@@ -57,6 +57,9 @@ class EpisodeCollector(PooledWorldWrapper):
         self._where = torch.tensor(self.rows, dtype=torch.int64, device=world.device)
         self._slots = world.task_id[self._where].tolist()
         self._pools: list[np.ndarray] = []
+        self._first_pools: list[np.ndarray] = []
+        if isinstance(world, PooledWorld):
+            self._first_pools = [pool.copy() for pool in world.pools]
         self._forget()
 
     def _forget(self) -> None:
@@ -155,6 +158,7 @@ class EpisodeCollector(PooledWorldWrapper):
         instruction = ""
         if self._pools:
             variation = self._pools[slot][task].copy()
+            task = _index_in(self._first_pools[slot], variation, task)
         describe = getattr(self.world, "instruction", None)
         if describe is not None:  # worlds of other libraries have no sentences
             instruction = describe(slot, variation)
@@ -225,6 +229,17 @@ class EpisodeCollector(PooledWorldWrapper):
             self._pools = list(self.world.pools)
         else:
             self._pools = []
+
+
+def _index_in(pool: np.ndarray, variation: np.ndarray, index: int) -> int:
+    """Return the index of a task in a pool (k, v): ``index`` if this task is there, and -1 if the pool lacks it.
+
+    Learners may play their tasks in other pools, for example in another order.
+    """
+    same = np.flatnonzero((pool == variation).all(axis=1))
+    if index in same:
+        return index
+    return int(same[0]) if len(same) else -1
 
 
 class RunCollector(EpisodeCollector):

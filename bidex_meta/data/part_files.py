@@ -56,7 +56,7 @@ class Episode:
     truncated: np.ndarray  # (T,), bool: true at most for the last one: time was up, or physics broke next
     task: int = 0  # slot of the world
     task_name: str = ""  # name of the slot: a class, or ``Class/task``
-    task_index: int = 0  # index of the task in the slot's pool
+    task_index: int = 0  # index of the task in the slot's pool; -1 for a new task, which the pool lacks
     variation: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (v,), float64: values that the task fixes
     success: bool = False  # by the suite's rule: the goal was met at any step, or held at the end
     broken: bool = False  # whether physics broke in the next transition, which is left out

@@ -10,7 +10,7 @@ from bidex_meta.data import Dataset
 from bidex_meta.errors import one_line
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import Json
-from bidex_meta.runs.evaluations import ClassSummary, PolicyEvaluation, unusual_settings
+from bidex_meta.runs.evaluations import ClassSummary, MetaTestEvaluation, PolicyEvaluation, unusual_settings
 from bidex_meta.runs.provenance import versions_of
 from bidex_meta.runs.versions import Versions, parse_versions
 from bidex_meta.utils.files import portable
@@ -30,12 +30,17 @@ def run_card(folder: RunFolder, name: str) -> str:
     classes: dict[str, ClassSummary] = {}
     results = ""
     played = subject
-    if isinstance(evaluation, PolicyEvaluation) and evaluation.steps != steps:
+    if evaluation is not None and evaluation.steps != steps:
         results = "\nThe results are left out, because evaluation.json is not of the newest checkpoint.\n"
     elif isinstance(evaluation, PolicyEvaluation):
         classes = evaluation.policy.classes
         played = ", ".join([subject, *unusual_settings(evaluation)])
         results = f"\nResults of the policy of {steps:,} steps on {played}:\n{_table(classes)}"
+    elif isinstance(evaluation, MetaTestEvaluation):
+        for split, part in evaluation.splits.items():
+            played = ", ".join([f"{split} tasks of {subject}", *unusual_settings(evaluation)])
+            results += f"\nResults on {played}, before adaptation:\n{_table(part.before.classes)}"
+            results += f"\nAfter {part.shots} shots of {part.rollouts} episodes:\n{_table(part.after.classes)}"
     mean = sum(row.success for row in classes.values()) / max(len(classes), 1)
     found = [{"type": "success rate", "value": round(mean, 4), "name": "mean over classes"}]
     header = {

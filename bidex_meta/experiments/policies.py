@@ -46,13 +46,32 @@ def _loaded(folder: RunFolder, which: str) -> tuple[Json, int]:
         return folder.checkpoints.load_one(folder.checkpoints.best)
     if which != "last":
         own = folder.checkpoints.folder / which
-        return folder.checkpoints.load_one(own if is_file(own) else Path(which))
+        if own.parent == folder.checkpoints.folder and is_file(own):
+            return folder.checkpoints.load_one(own)
+        found = folder.checkpoints.load_one(Path(which))
+        _check_shape(folder, found[0], which)
+        return found
     loaded = folder.checkpoints.load()
     if loaded is None:
         raise BidexError(
             f"{folder.path} has no checkpoint yet. Continue its training: bidex-meta run --resume {folder.path}"
         )
     return loaded
+
+
+def _check_shape(folder: RunFolder, state: Json, file: str) -> None:
+    """Raise BidexError if a checkpoint of elsewhere has a policy of another shape than the run's own checkpoint."""
+    own = folder.checkpoints.load()
+    if own is None:
+        return
+    with fitting(folder.path):
+        wanted = own[0]["learner"]["policy"].get("shape")
+        shape = state["learner"]["policy"].get("shape")
+    if shape != wanted:
+        raise BidexError(
+            f"{file}: expected a policy of the shape {wanted} of {folder.path}, got {shape}. Name a checkpoint of this "
+            "run."
+        )
 
 
 @contextlib.contextmanager
@@ -107,13 +126,19 @@ def policy_loader(folder: RunFolder, device: str, which: str = "last") -> tuple[
 
 
 def say_other_rules(folder: RunFolder, worlds: Worlds) -> None:
-    """Log one line if a run was trained under other rules than those of ``worlds``.
+    """Log a line if a run was trained under other rules than those of ``worlds``, and if only one of both hides goals.
 
     Rules are the suite's choices of reward, success condition, goal range and start states. Nothing is logged if the
     run's suite cannot be opened.
     """
     with contextlib.suppress(BidexError):  # the suite's file of the run may be missing
         learned = open_worlds(folder.config().to_json())
+        if learned.hides_goals != worlds.hides_goals:
+            told = {True: "hides goals", False: "shows goals"}
+            say(
+                f"Note: {folder.path} learned {learned.name}, which {told[learned.hides_goals]}; {worlds.name} "
+                f"{told[worlds.hides_goals]}."
+            )
         if learned.rules and worlds.rules and (apart := rules_apart(vars(learned.rules), worlds.rules)):
             say(f"Note: {folder.path} learned {learned.name} by other rules than those of {worlds.name}: {apart}.")
 

@@ -319,7 +319,9 @@ def _actor(settings: RecordConfig, path: Path, device: str) -> tuple[Actor, Json
     if Capability.ADAPTS in learner_kind(algo).capabilities:
         raise BidexError(f"{algo} adapts to tasks: it has no single policy to record. Name a run of another learner.")
     policy, steps = load_policy(folder, device, settings.checkpoint)
-    sampled = settings.actions == "sampled" and isinstance(policy, SamplingAgent)
+    # DAgger acts with its mean. Its std is only a start for learners that go on from its policy.
+    has_own_std = isinstance(policy, SamplingAgent) and Capability.TAUGHT not in learner_kind(algo).capabilities
+    sampled = settings.actions == "sampled" and has_own_std
     about = {"algo": algo, "run": folder.path.resolve().name, "steps": steps, "checkpoint": settings.checkpoint}
     about |= {"actions": "sampled" if sampled else "mean", "noise": settings.noise}
     return Actor(policy, sampled, settings.noise), about

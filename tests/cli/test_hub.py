@@ -12,6 +12,8 @@ import pytest
 
 from bidex_meta.cli import main
 from bidex_meta.runs import RunFolder
+from bidex_meta.runs.evaluations import ClassSummary, MetaTestEvaluation, SplitSummary, Summary, evaluation_json
+from tests.fakes import trained_run
 from tests.pages import ROOT
 
 HAND_OVER = ROOT / "results" / "teachers" / "HandOver"
@@ -55,6 +57,20 @@ def test_a_card_has_no_results_of_another_checkpoint(shown, tmp_path: Path, step
     assert "results are left out, because evaluation.json is not of the newest checkpoint" in card
     assert "model-index" not in card and "| HandOver | " not in card and "evaluated on" not in card
     assert "| steps | 3,489,792 |" in card
+
+
+def test_a_card_of_a_learner_that_adapts_has_its_meta_test(shown, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(trained_run("promp"), tmp_path / "run"))
+    loaded = RunFolder.open(run).checkpoints.load()
+    assert loaded is not None
+    before, after = (Summary(classes={"Switch": ClassSummary(success=x, mean_return=9.0)}) for x in (0.25, 0.75))
+    split = SplitSummary(shots=2, rollouts=7, trials=1, before=before, after=after, by_shot=[before, after])
+    evaluation = MetaTestEvaluation(splits={"test": split}, steps=loaded[1])
+    (run / "evaluation.json").write_text(json.dumps(evaluation_json(evaluation)))
+    shown("push", run, f"folder:{tmp_path / 'hub'}")
+    card = (tmp_path / "hub" / "README.md").read_text()
+    assert "Results on test tasks of" in card and "| Switch | 25.0 % | 9 |" in card
+    assert "After 2 shots of 7 episodes:\n\n| class | success | return |\n|---|---|---|\n| Switch | 75.0 %" in card
 
 
 def test_a_card_names_steps_split_and_randomisation_of_its_results(shown, tmp_path: Path) -> None:

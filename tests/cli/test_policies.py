@@ -1,5 +1,6 @@
 """From a checkpoint to its policy."""
 
+import os
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,7 +10,7 @@ import pytest
 from bidex_meta.cli.looking import looked_at
 from bidex_meta.cli.parsing import LookFlags
 from bidex_meta.errors import BidexError
-from bidex_meta.experiments import run_data
+from bidex_meta.experiments import recording, run_data
 from bidex_meta.experiments.policies import load_checkpoint, policy_of
 from bidex_meta.rules import V1, V2
 from bidex_meta.runs import RunFolder
@@ -56,6 +57,40 @@ def test_a_policy_in_worlds_of_other_rules_is_noted(tmp_path: Path, caplog: pyte
     caplog.clear()
     looked_at(LookFlags(policy="zero", suite="MT4-v2"))
     assert not caplog.messages
+
+
+def test_a_policy_where_goals_are_shown_that_it_never_saw_is_noted(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", "bidex_meta")
+    run = trained_run("promp")
+    suite = RunFolder.open(run).config().suite
+    assert suite is not None
+    looked_at(LookFlags(run=run, suite=suite.replace("ML", "MT")))
+    assert any(f"learned {suite}, which hides goals; " in note for note in caplog.messages)
+
+
+def test_a_folder_may_be_called_as_a_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(trained_run("mtppo"), "random")
+    assert looked_at(LookFlags(run=Path("random")))[0].name == "MT4"
+    assert LookFlags(policy="random").actor == "random"
+
+
+def test_a_checkpoint_of_a_policy_of_another_shape_is_refused(tmp_path: Path) -> None:
+    teachers = paths.suites_dir().parent / "results" / "teachers"
+    folder = RunFolder.open(teachers / "CatchUnderarm")
+    [own] = folder.checkpoints.folder.glob("*.pt")
+    [other] = (teachers / "TwoCatchUnderarm" / "checkpoints").glob("*.pt")
+    for file in (str(other), os.path.relpath(other)):
+        with pytest.raises(BidexError, match=r"expected a policy of the shape .*422.*, got .*446"):
+            load_checkpoint(folder, file)
+    for file in (str(own), own.name, os.path.relpath(own)):
+        assert load_checkpoint(folder, file)[1] == load_checkpoint(folder)[1]
+
+
+def test_a_dagger_policy_is_recorded_as_it_acts() -> None:
+    for run, expected in ((paths.shipped_policy(), "mean"), (trained_run("mtppo"), "sampled")):
+        actor, about = recording._actor(recording.RecordConfig("expert", (run,)), run, "cpu")
+        assert (about["actions"], actor.sampled) == (expected, expected == "sampled")
 
 
 def test_a_run_is_shown_with_its_own_tasks_unless_a_seed_is_named(tmp_path: Path) -> None:

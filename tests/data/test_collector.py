@@ -14,7 +14,7 @@ from bidex_meta.data.collector import BROKEN, CUT, SHORTENED, EpisodeCollector, 
 from bidex_meta.data.writer import DatasetWriter, finish
 from bidex_meta.errors import BidexError
 from bidex_meta.world.contract import State
-from tests.algos.families import Passing
+from tests.algos.families import Passing, PointClass, PointGoals
 from tests.data.worlds import Plain, Rough, rough, same
 from tests.world.play import suite_world
 
@@ -112,6 +112,22 @@ def test_what_is_stored_is_what_a_plain_loop_saw(seed, steps, mode, breaks_at, l
             assert np.array_equal(held["observations"], first) and np.array_equal(held["next_observations"], after)
             assert held["task"].tolist() == [e.task for e in seen for _ in range(len(e))]
             assert held["terminated"].tolist() == [bool(flag) for e in seen for flag in e.terminated]
+
+
+def test_a_task_keeps_its_index_in_the_suites_pool_whatever_a_learner_plays() -> None:
+    """RL² turns the pool from trial to trial, MAML puts a meta-batch in its place."""
+    world = PointGoals(rows=2, classes=(PointClass(steps=4, count=6),))
+    (pool,) = [pool.copy() for pool in world.pools]
+    episodes: list[Episode] = []
+    collector = EpisodeCollector(world, episodes.append)
+    played = [np.roll(pool, -2, axis=0), pool[[4, 4]], pool[:2] + 0.25]
+    for tasks in played:
+        collector.set_tasks({world.task_names[0]: tasks})
+        collector.reset()
+        for _ in range(4):
+            collector.step(torch.zeros(2, 2))
+    assert [episode.task_index for episode in episodes] == [2, 3, 4, 4, -1, -1]
+    assert np.array_equal(episodes[-1].variation, pool[1] + 0.25)
 
 
 def test_what_is_left_out_is_counted() -> None:

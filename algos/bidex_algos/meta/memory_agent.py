@@ -66,7 +66,7 @@ class MemoryAgent:
         if valid is None:
             moved = torch.ones_like(ended)
         else:
-            moved = ~self._over
+            moved = valid | ~self._over  # a caller may reset some environments while others play on
         after = Memory(self._next_state, timestep.action, timestep.reward.masked_fill(~known, 0.0), known, ended)
         self._learned = self._learned.replaced(moved, after)
         self._begun = self._begun | moved
