@@ -245,6 +245,7 @@ def test_a_step_tells_its_transition(case: Case) -> None:
             assert (value[frozen] == 0).all()
         returns, lengths = returns + reward.cpu(), lengths + (~frozen).cpu()
         success |= (info["success"] & ~frozen).cpu()
+        success &= ~info["unstable"].cpu()  # an episode whose physics broke is no success
         assert torch.allclose(info["running"]["r"].cpu(), returns) and torch.equal(info["running"]["l"].cpu(), lengths)
         assert torch.equal(info["running"]["success"].cpu(), success)
         seen += int(ended.sum())

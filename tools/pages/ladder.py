@@ -335,7 +335,7 @@ def _verdict(suite: str, lines: dict[str, Line], pairs: Sequence[Sequence[str]])
         reasons.append(f"{separated} pairs of reward-only learners are separated, and {_PAIRS_AT_LEAST} are required")
     if not reasons:
         return (
-            f"This suite meets the criteria for a good suite, defined below. In {separated} pairs of learners that see "
-            "only rewards, the worst seed of one learner is better than the best seed of the other."
+            f"This suite meets the criteria below. In {separated} pairs of learners that see only rewards, the worst "
+            "seed of one learner is better than the best seed of the other."
         )
     return f"The suite does not yet meet the criteria for a good suite, defined below: {'; '.join(reasons)}."
