@@ -95,10 +95,7 @@ def test_a_shot_has_the_episodes_that_environments_of_a_task_share() -> None:
 
 def test_pairs_are_of_learners_that_see_their_own_rewards() -> None:
     lines = table(*learners())
-    assert any(
-        line.startswith("This suite meets the criteria below. In 3 pairs of learners")
-        for line in lines
-    )
+    assert any(line.startswith("This suite meets the criteria below. In 3 pairs of learners") for line in lines)
     pairs = [cells(line) for line in lines[-3:]]
     assert [(first, second, apart) for first, second, *_, apart in pairs] == [
         ("a", "b", "yes"), ("a", "c", "yes"), ("b", "c", "yes")
