@@ -134,11 +134,11 @@ def say_other_rules(folder: RunFolder, worlds: Worlds) -> None:
     with contextlib.suppress(BidexError):  # the suite's file of the run may be missing
         learned = open_worlds(folder.config().to_json())
         if learned.hides_goals != worlds.hides_goals:
-            told = {True: "hides goals", False: "shows goals"}
-            say(
-                f"Note: {folder.path} learned {learned.name}, which {told[learned.hides_goals]}; {worlds.name} "
-                f"{told[worlds.hides_goals]}."
-            )
+            if learned.hides_goals:
+                difference = f"which hides goals; {worlds.name} shows goals"
+            else:
+                difference = f"which shows goals; {worlds.name} hides goals"
+            say(f"Note: {folder.path} learned {learned.name}, {difference}.")
         if learned.rules and worlds.rules and (apart := rules_apart(vars(learned.rules), worlds.rules)):
             say(f"Note: {folder.path} learned {learned.name} by other rules than those of {worlds.name}: {apart}.")
 

@@ -86,7 +86,7 @@ def quarter(
     if file.exists():
         stored = json.loads(file.read_text())
         for what, known, now in (
-            ("settings", stored["setting"], setting),
+            ("settings", stored.get("setting"), setting),
             ("code", stored["versions"].get("git"), result["versions"].get("git")),
         ):
             if known != now:
