@@ -209,7 +209,9 @@ class PourWater(ReachTask):
     goal would also meet if the bucket were lifted and tipped under an upright kettle. The spout only gets near the
     sinking goal if the kettle is tilted over the rim. At less than 30 degrees of tilt no water leaves, and the spout
     stays 3 cm away from the goal. At 40 degrees it is 2 cm away, and from 60 degrees on it reaches the goal. The goal's
-    orientation is the kettle's orientation at the task's start, tilted by 40 degrees towards the spout.
+    orientation is the kettle's orientation at the task's start, tilted by 40 degrees towards the spout. With wide
+    variation, as in version 2, every episode places kettle and bucket anew: the goal's position is the place on the
+    table where the task wants the bucket, and its orientation that of a tilted kettle at its nominal place.
 
     A task shifts and turns the bucket, and the kettle with the water. The water consists of drops without friction, of
     5 mm radius; observations do not show the drops. With twelve drops, the default, physics takes 1.4 times as long as
