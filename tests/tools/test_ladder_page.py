@@ -31,7 +31,7 @@ def summary(success: float) -> Summary:
 
 def run(
     arm: str, seed: int, *success: float, suite: str = SUITE, hidden: float | None = None, unseen: float | None = None,
-    rollouts: int = 1
+    rollouts: int = 1, start_from: str | None = None
 ) -> Any:  # fmt: skip
     """A stored run: of a learner that adapts if there is success after several numbers of episodes."""
     if len(success) == 1:
@@ -47,8 +47,10 @@ def run(
         found = MetaTestEvaluation(splits={"test": split})
         algo = arm if arm in ("icl", "maml") else "rl2"
     settings = {"algo": algo, "suite": suite, "seed": seed}
-    content = {"steps": 1000, "seconds": 120.0, "suite": {"name": suite}, "config": settings}
-    config = SimpleNamespace(algo=algo, seed=seed, task=None)
+    content = {
+        "name": f"{arm}-{seed}", "steps": 1000, "seconds": 120.0, "suite": {"name": suite}, "config": settings
+    }  # fmt: skip
+    config = SimpleNamespace(algo=algo, seed=seed, task=None, start_from=start_from)
     path = Path("results/data/ladder.json")
     return SimpleNamespace(arm=arm, path=path, content=content, evaluation=lambda: found, config=lambda: config)
 
@@ -91,6 +93,22 @@ def test_a_shot_has_the_episodes_that_environments_of_a_task_share() -> None:
     shared = run("maml", 0, 0.1, 0.2, 0.3, rollouts=25)
     rows = [cells(line) for line in table(alone, shared)[4:6]]
     assert [row[5] for row in rows] == ["1", "25"]
+
+
+def test_steps_and_minutes_include_the_runs_that_a_learner_starts_from() -> None:
+    blind = run("ppo", 0, 0.1)
+    adapts = run("maml", 0, 0.1, 0.2, 0.3, start_from="ppo-0")
+    assert [cells(line)[3:5] for line in table(adapts, blind)[4:6]] == [["1,000 + 1,000", "2 + 2"], ["1,000", "2"]]
+    with pytest.raises(BidexError, match=r"maml-0 started from the policy of ppo-0\. Collect that run too"):
+        table(adapts)
+
+
+def test_the_figure_says_how_many_episodes_a_shot_has() -> None:
+    runs = [run("maml", 0, 0.1, 0.2, 0.3, suite=SUITE, rollouts=25), run("a", 0, 0.1, 0.2, 0.3, rollouts=25)]
+    runs.append(run("maml", 0, 0.1, 0.2, 0.3, suite=OTHER_TEST_TASKS, rollouts=10))
+    study: Any = SimpleNamespace(split=None, runs=runs)
+    legend = ladder_figure(study).legends[0]
+    assert {text.get_text() for text in legend.get_texts()} == {"a", "maml, 10 to 25 episodes per shot"}
 
 
 def test_pairs_are_of_learners_that_see_their_own_rewards() -> None:

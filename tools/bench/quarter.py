@@ -57,7 +57,7 @@ def quarter(
 ) -> Json:
     """Measure and train what needs a GPU, in steps that fit into a given time.
 
-    The steps are: compile kernels, run tests, measure switches and pictures, train some short runs, and use the
+    The steps are: compile kernels, run tests, measure switches, train some short runs, measure pictures, and use the
     remaining time for a longer run. Each step is a process with its own time limit. The next step begins even if a step
     fails or reaches its limit. Another call repeats such steps, continues their runs, and skips completed steps.
 
@@ -121,12 +121,12 @@ def _steps(
     yield _Step("tests", [*tests, "-m", "gpu and not slow and not parity"], 120.0)
     measured = ["--sizes", *map(str, sizes), "--out", str(out / "switches.json")]
     yield _Step("switches", [*bench, "switches", *world, *measured], 240.0)
-    drawn = ["--device", device, "--suites", suite, suite.replace("MT", "ML", 1)]
-    drawn += ["--num-envs", str(max(1, sizes[-1] // 16))]
-    yield _Step("pictures", [*bench, "pictures", *drawn, "--out", str(out / "pictures.json")], 90.0)
     for name, (on, algo, preset, share) in TRAININGS.items():
         flags = ["--algo", algo, "--preset", preset, "--device", device, "--num-envs", str(round(share * num_envs))]
         yield _training(out / name, on, flags, seconds)
+    drawn = ["--device", device, "--suites", suite, suite.replace("MT", "ML", 1)]
+    drawn += ["--num-envs", str(max(1, sizes[-1] // 16))]
+    yield _Step("pictures", [*bench, "pictures", *drawn, "--out", str(out / "pictures.json")], 90.0)
     if rest is None:
         rest = max(end - time.monotonic() - _STARTING, seconds)
     flags = ["--algo", "mtppo", "--preset", "v2", "--device", device, "--num-envs", str(num_envs)]

@@ -5,7 +5,7 @@ Meta-learners are compared with a policy that sees neither goal nor rewards, and
 
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
@@ -62,6 +62,8 @@ class Line:
     """Numbers of exploring episodes of a task in one shot; empty if the learner does not explore."""
     runs: list[StoredRun] = field(default_factory=list)
     """The run of each seed."""
+    starts: list[StoredRun] = field(default_factory=list)
+    """The run whose policy each seed started from; empty if the learner starts from scratch."""
     on_train_tasks: bool = False
     """True if the results are on train tasks although the suite has other test tasks."""
 
@@ -74,6 +76,14 @@ class Line:
     def last(self) -> np.ndarray:
         """Return the success after all exploring episodes, (seeds, 1)."""
         return np.array([[each[-1]] for each in self.shares])
+
+    def effort(self, key: str, unit: float, form: str) -> str:
+        """Return the mean of an entry of the runs, such as their steps, in units of ``unit``.
+
+        If the learner starts from the policies of other runs, the mean over those comes first: "3,000 + 1,000".
+        """
+        means = [np.mean([run.content[key] for run in runs]) / unit for runs in (self.starts, self.runs) if runs]
+        return " + ".join(format(mean, form) for mean in means)
 
 
 def ladder_table(*studies: Study) -> Iterator[str]:
@@ -134,10 +144,12 @@ def _classes(file: Path) -> list[Json]:
 def ladder_figure(*studies: Study) -> "Figure":
     """Draw success after each shot: a panel per suite, a line per learner, horizontal lines for PPO.
 
-    Bands show the worst and the best seed.
+    Bands show the worst and the best seed. The legend says how many exploring episodes of a task the learner has in a
+    shot if it has more than one.
     """
     panels: dict[str, list[plots.Group]] = {}
     suites = _suites(studies)
+    labels = _legend(suites.values())
     most = max(len(each) for lines in suites.values() for line in lines.values() for each in line.shares)
     for suite, lines in suites.items():
         panels[suite] = []
@@ -147,7 +159,7 @@ def ladder_figure(*studies: Study) -> "Figure":
                 ends = shares.min(0), shares.max(0)
             else:
                 ends = None, None
-            panels[suite].append((name, {"success": plots.Curve(np.arange(most), shares.mean(0), *ends)}))
+            panels[suite].append((labels[name], {"success": plots.Curve(np.arange(most), shares.mean(0), *ends)}))
     figure = plots.draw_panels(panels, "success", "success", (1.0, "shots of exploring episodes"))
     for axis in figure.axes:
         axis.set_xticks(range(most))
@@ -155,11 +167,28 @@ def ladder_figure(*studies: Study) -> "Figure":
     return figure
 
 
+def _legend(suites: Iterable[dict[str, Line]]) -> dict[str, str]:
+    """Return the label of each learner: its name, and its numbers of exploring episodes in a shot."""
+    episodes: dict[str, set[int]] = {}
+    for lines in suites:
+        for name, line in lines.items():
+            episodes.setdefault(name, set()).update(line.rollouts)
+    labels = {}
+    for name, numbers in episodes.items():
+        if max(numbers, default=1) == 1:
+            labels[name] = name
+        else:
+            ends = sorted({min(numbers), max(numbers)})
+            labels[name] = f"{name}, {' to '.join(map(str, ends))} episodes per shot"
+    return labels
+
+
 def _suites(studies: Sequence[Study]) -> dict[str, dict[str, Line]]:
     """Group runs by meta suite and learner, and order the learners of each suite.
 
     Goal-shown PPO comes first, then the other learners by success, and blind PPO last. Raises BidexError if the runs of
-    a learner are not seeds of one setting, or if only some of them are evaluated on unseen tasks.
+    a learner are not seeds of one setting, if only some of them are evaluated on unseen tasks, or if the run is missing
+    from whose policy a run started.
     """
     found: dict[str, dict[str, Line]] = {}
     runs = [(study.split or "test", run) for study in studies for run in study.runs]
@@ -181,6 +210,7 @@ def _suites(studies: Sequence[Study]) -> dict[str, dict[str, Line]]:
             )
         line.on_train_tasks = on_train_tasks
         line.runs.append(run)
+        line.starts += _start(run, [other for _, other in runs])
         line.shares.append([float(np.mean([shot[name].success for name in names])) for shot in by_shot])
         evaluation = run.evaluation()
         if isinstance(evaluation, MetaTestEvaluation):
@@ -191,6 +221,17 @@ def _suites(studies: Sequence[Study]) -> dict[str, dict[str, Line]]:
         for learner, line in lines.items():
             refuse_differing(f"{learner} on {suite}", line.runs)
     return {suite: dict(sorted(lines.items(), key=_place)) for suite, lines in sorted(found.items())}
+
+
+def _start(run: StoredRun, runs: Sequence[StoredRun]) -> list[StoredRun]:
+    """Return the run among ``runs`` from whose policy a run started; an empty list if it started from scratch."""
+    name = run.config().start_from
+    if name is None:
+        return []
+    found = [other for other in runs if other.content["name"] == name]
+    if not found:
+        raise BidexError(f"{run.content['name']} started from the policy of {name}. Collect that run too.")
+    return found[:1]
 
 
 def _suite(run: StoredRun) -> str:
@@ -272,8 +313,8 @@ def _row(name: str, line: Line, lines: dict[str, Line]) -> list[str]:
         gap = lines[SHOWN].last.mean() - low
         if gap > _LEAST_GAP:
             closed = mean_and_range(100.0 * (line.last[:, 0] - low) / gap, ".0f", " %")
-    steps = f"{int(np.mean([run.content['steps'] for run in line.runs])):,}"
-    minutes = f"{np.mean([run.content['seconds'] for run in line.runs]) / 60:.0f}"
+    steps = line.effort("steps", 1.0, ",.0f")
+    minutes = line.effort("seconds", 60.0, ".0f")
     rollouts = ", ".join(map(str, sorted(line.rollouts)))
     return [name, line.given, str(len(line.shares)), steps, minutes, rollouts, *shown, closed]
 
