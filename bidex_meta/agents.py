@@ -2,6 +2,7 @@
 
 from typing import NamedTuple, Protocol, runtime_checkable
 
+import torch
 from torch import Tensor
 
 
@@ -39,6 +40,13 @@ class Timestep(NamedTuple):
     """Observations after the transition, in the same episode, ``(num_envs, observation)``."""
     valid: Tensor | None = None
     """Bool ``(num_envs,)``: False for environments that are frozen after their episode, or whose physics broke."""
+
+    @property
+    def valid_mask(self) -> Tensor:
+        """Return ``valid``; if it is None, as in Meta-World's evaluation, all environments are valid."""
+        if self.valid is None:
+            return torch.ones_like(self.terminated, dtype=torch.bool)
+        return self.valid
 
 
 class MetaLearningAgent(Agent, Protocol):

@@ -51,7 +51,7 @@ def evaluated_run(
     """A run's folder with metrics and an evaluation of classes with these success rates."""
     path = root / f"{algo}_{task}_{seed}_{learner}"
     folder = RunFolder.create(run_config(task=task, algo=algo, seed=seed, learner=learner), path)
-    metrics = [{"step": 500, "Perf/collection_time": 1700.0, "Perf/learning_time": 100.0}, {"step": 1000}]
+    metrics = [{"step": 500, "Perf/training_time": 1800.0}, {"step": 1000}]
     folder.metrics_path.write_text("".join(json.dumps(row) + "\n" for row in metrics))
     classes = {name: {"success": s, "return": 10 * s, "score": 100 * s} for name, s in successes.items()}
     (path / "evaluation.json").write_text(json.dumps({"policy": {"classes": classes}}))

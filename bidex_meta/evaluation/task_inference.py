@@ -148,6 +148,9 @@ def identifiability(world: World, explorer: Agent | None = None, seed: int = 0) 
     errors = []
     for row in range(world.num_envs):
         steps = alive[:, row].nonzero().squeeze(1)
+        if len(steps) == 0:  # the physics broke in the first step
+            errors.append(math.inf)
+            continue
         steps = steps[torch.linspace(0, len(steps) - 1, _STEPS).round().long().unique()]
         errors.append(_fit(member.scene, sensors[steps, row], rewards[steps, row], pool[row], seed + row))
     worst = np.array(errors)

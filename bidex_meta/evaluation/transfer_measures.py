@@ -41,7 +41,7 @@ def median_steps(counts: Sequence[int | None]) -> int | None:
 
 
 def at_the_end(folders: Sequence[RunFolder]) -> Json:
-    """Return success and return in the final evaluation (4 episodes per task) of runs that differ only in the seed."""
+    """Return success and return in the final evaluation of runs that differ only in the seed."""
     success = []
     returns = []
     for folder in folders:

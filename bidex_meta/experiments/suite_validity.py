@@ -162,7 +162,10 @@ def _results(worlds: Worlds, world: World, runs: Sequence[Path]) -> dict[str, di
         own = open_worlds(config)
         say_other_rules(folder, worlds)
         agent, _ = load_policy(folder, "cpu")
-        for name, result in own.evaluate(agent, own.world(), own.protocol("train", 1)).classes.items():
+        world_of_run = own.world()
+        played = own.evaluate(agent, world_of_run, own.protocol("train", 1))
+        world_of_run.close()
+        for name, result in played.classes.items():
             if rules.get(plain_name(name)) == own.task_classes()[name].rules:
                 results[plain_name(name)][folder.path.name] = result
     return results

@@ -185,16 +185,18 @@ class RunFolder:
         The lock also ends if this process is killed, and leaves no file. Raises BidexError, with ``message``, if
         another process holds the lock.
         """
+        if fcntl is None:  # such a system cannot open folders either
+            yield
+            return
         handle = os.open(self.path, os.O_RDONLY)
         try:
-            if fcntl is not None:
-                try:
-                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    message = message or f"Another process trains in {self.path}. Wait for its end, or stop it."
-                    raise BidexError(message) from None
-                except OSError:
-                    pass  # a network file system may not lock folders
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                message = message or f"Another process trains in {self.path}. Wait for its end, or stop it."
+                raise BidexError(message) from None
+            except OSError:
+                pass  # a network file system may not lock folders
             yield
         finally:
             os.close(handle)

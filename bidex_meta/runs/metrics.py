@@ -81,17 +81,9 @@ def last_rows(path: Path) -> list[Json]:
 
 @checked_arguments
 def training_seconds(rows: Sequence[Json]) -> float:
-    """Return the wall time of a run's training, s, over all resumes, from the lines of a ``metrics.jsonl``.
-
-    Older runs did not log the training time. For these runs the result is the time of the iterations, without
-    checkpoints.
-    """
+    """Return the wall time of a run's training, s, over all resumes, from the lines of a ``metrics.jsonl``."""
     logged = [row["Perf/training_time"] for row in rows if row.get("Perf/training_time") is not None]
-    unlogged = []
-    for row in rows:
-        if "Perf/training_time" not in row:
-            unlogged += [row.get("Perf/collection_time") or 0.0, row.get("Perf/learning_time") or 0.0]
-    return max(logged, default=sum(unlogged))
+    return max(logged, default=0.0)
 
 
 @checked_arguments

@@ -47,9 +47,10 @@ def train(
 
     Both limits include the steps and the seconds (``spent_seconds``) of a run that is resumed. Time counts from the
     first world step to the end of an iteration, including checkpoints; metrics contain it as ``Perf/training_time``.
-    There is at least one iteration. If any process receives SIGINT, SIGTERM, SIGHUP, SIGUSR1 or SIGUSR2 (unless
-    ignored), all processes finish the iteration, save and return. A BrokenPipeError of ``record``, ``watch`` or
-    ``should_stop`` has the same effect. After SIGINT or SIGTERM, another SIGINT or SIGTERM acts at once.
+    There is no iteration if a limit is reached before the first one. If any process receives SIGINT, SIGTERM, SIGHUP,
+    SIGUSR1 or SIGUSR2 (unless ignored), all processes finish the iteration, save and return. A BrokenPipeError of
+    ``record``, ``watch`` or ``should_stop`` has the same effect. After SIGINT or SIGTERM, another SIGINT or SIGTERM
+    acts at once.
 
     Args:
         learner: Learner that trains on ``world``.

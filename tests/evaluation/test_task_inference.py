@@ -2,14 +2,17 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from bidex_meta import Benchmark
 from bidex_meta.cli import main
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation import task_inference
 from bidex_meta.evaluation.results import ClassResult
 from bidex_meta.evaluation.task_inference import Alignment, alignment, blind_ceiling, identifiability, listed_ceiling
 from bidex_meta.experiments import suite_validity
@@ -70,6 +73,19 @@ def test_rewards_of_one_episode_tell_what_is_hidden_and_a_broken_class_is_found_
     task.errors = lambda state: [Error(state["left/palm_position"].norm(dim=1), 0.1)]  # type: ignore[method-assign]
     found = identifiability(world)
     assert found.share <= 0.5 and found.errors.max() > 1.0
+
+
+def test_an_episode_that_breaks_in_its_first_step_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    explore = task_inference._explore
+
+    def broken(*given: Any) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        sensors, rewards, alive = explore(*given)
+        alive[:, 0] = False
+        return sensors, rewards, alive
+
+    monkeypatch.setattr(task_inference, "_explore", broken)
+    found = identifiability(world_of("BottleCap-v2", True, 2, tasks=2))
+    assert found.errors[0] == np.inf and found.share == 0.5
 
 
 def test_the_command_measures_a_suite_and_replays_witnesses(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ import pytest
 from bidex_algos.onpolicy.mtppo import MTPPO
 from bidex_meta.cli import main
 from bidex_meta.runs import Progress, Recorder, RunFolder
+from bidex_meta.runs import folder as folder_module
 from bidex_meta.worlds.own import OwnSuite
 from tests.fakes import ToyWorld, run_config
 
@@ -58,6 +59,12 @@ def test_two_processes_do_not_train_in_one_folder(run: Path, capsys: pytest.Capt
         assert "Another process trains in" in refused(capsys, "run", "--resume", run, "--steps", "96")
     assert main(["run", "--resume", str(run), "--steps", "96", "--no-evaluate"]) == 0
     assert not list(run.glob("*lock*"))
+
+
+def test_a_system_without_locks_trains_without_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(folder_module, "fcntl", None)
+    with RunFolder(tmp_path / "not here").locked(), RunFolder(tmp_path / "not here").locked():
+        pass  # Windows cannot open a folder, so nothing may try to
 
 
 def test_a_start_that_was_torn_begins_again(toy: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -87,10 +87,7 @@ class MetaPolicy(nn.Module):
         """Store one transition of every environment."""
         terminated = timestep.terminated.bool()
         truncated = timestep.truncated.bool()
-        if timestep.valid is None:
-            valid = torch.ones_like(terminated)
-        else:
-            valid = timestep.valid
+        valid = timestep.valid_mask
         if self.elapsed is None:
             elapsed = torch.zeros_like(terminated, dtype=torch.int64)
         else:

@@ -55,10 +55,7 @@ class LatentAgent:
             following = timestep.observation
         else:
             following = timestep.next_observation
-        if timestep.valid is None:
-            valid = torch.ones_like(timestep.terminated)
-        else:
-            valid = timestep.valid
+        valid = timestep.valid_mask
         reward = timestep.reward.masked_fill(~valid, 0.0)
         added = self.policy.evidence(timestep.observation, timestep.action, reward, following)
         self._sums = self._sums + added.masked_fill(~valid[:, None], 0.0)

@@ -56,18 +56,10 @@ class MemoryAgent:
         """Store one transition of every environment, except environments that wait for ``reset`` after an episode."""
         if self._learned is None or self._next_state is None:
             return
-        valid = timestep.valid
+        valid = timestep.valid_mask
         ended = timestep.terminated | timestep.truncated
-        # Meta-World's evaluation does not pass the mask of valid rows, because all rows are valid.
-        if valid is None:
-            known = torch.ones_like(ended)
-        else:
-            known = valid
-        if valid is None:
-            moved = torch.ones_like(ended)
-        else:
-            moved = valid | ~self._over  # a caller may reset some environments while others play on
-        after = Memory(self._next_state, timestep.action, timestep.reward.masked_fill(~known, 0.0), known, ended)
+        moved = valid | ~self._over  # a caller may reset some environments while others play on
+        after = Memory(self._next_state, timestep.action, timestep.reward.masked_fill(~valid, 0.0), valid, ended)
         self._learned = self._learned.replaced(moved, after)
         self._begun = self._begun | moved
         self._over = (self._over & ~moved) | ended
@@ -93,10 +85,7 @@ class MemoryAgent:
         """Write the reward of the last step into the memory of each evaluation episode."""
         if self._playing is None:
             return
-        if timestep.valid is None:
-            known = torch.ones_like(timestep.terminated)
-        else:
-            known = timestep.valid
+        known = timestep.valid_mask
         reward = timestep.reward.masked_fill(~known, 0.0)
         self._playing = replace(self._playing, reward=reward, known=known)
 
