@@ -34,6 +34,6 @@ def main(arguments: Sequence[str]) -> None:
     )
     if found.gap_as_played > TOLERANCE:
         print(
-            "On this machine the run's policy computes in bfloat16: its actions are up to "
+            "On this machine the run's policy computes in bfloat16: on these observations its actions are up to "
             f"{found.gap_as_played:.1g} away."
         )

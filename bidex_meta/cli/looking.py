@@ -58,6 +58,8 @@ def looked_at(flags: LookFlags, all_slots: bool = False) -> tuple[Worlds, list[s
             config = replace(config, seed=run.seed, task_seed=run.task_seed)
         config = replace(config, suite=config.suite or run.suite, task=config.task or run.task)
         config = replace(config, base=run.base, points=run.points, touch=run.touch)
+        if flags.suite is None and flags.task is None:
+            config = replace(config, switches=run.switches)
         own_task = flags.task is None or flags.task.casefold() == str(run.task).casefold()
         if own_task and flags.suite is None and flags.object is None:
             config = replace(config, object=run.object)

@@ -181,10 +181,12 @@ class TrialEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     @checked_arguments
     def __init__(
-        self, suite: str | Path | Suite, split: str = "train", episodes: int = EPISODES, seed: int | None = None,
-        render_mode: str | None = None
+        self, suite: str | Path | Suite | None = None, split: str = "train", episodes: int = EPISODES,
+        seed: int | None = None, render_mode: str | None = None
     ) -> None:  # fmt: skip
         task_seed, self._first_seed = both_seeds(seed)
+        if suite is None:
+            raise _no_suite()
         benchmark = Benchmark(suite, task_seed)
         _check_hides(benchmark.suite.observation == "masked", benchmark.name)
         if split not in SPLITS:
@@ -233,7 +235,7 @@ class TrialEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if self._left == 0:
             raise BidexError("Expected reset() before step(): there is no running trial.")
         obs, reward, terminated, truncated, info = self._env.step(action)
-        self._solved |= info["success"] > 0.0
+        self._solved = (self._solved or info["success"] > 0.0) and not info["unstable"]
         ended = terminated or truncated
         if ended:
             info["episode_success"] = self._solved
@@ -276,13 +278,15 @@ class TrialEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 def make_trials(
-    suite: str, split: str = "train", episodes: int = EPISODES, num_envs: int = 1,
+    suite: str | None = None, split: str = "train", episodes: int = EPISODES, num_envs: int = 1,
     seed: int | None = None, benchmark_seed: int | None = None, render_mode: str | None = None, **options: Any
 ) -> TrialWorld:  # fmt: skip
     """Make the world of `gymnasium.make_vec("bidex-meta/trials", num_envs=64, suite="ML1-v2")`.
 
     `episodes` is the number of episodes in a trial; other arguments are those of `make_suite_world`, without `stagger`.
     """
+    if suite is None:
+        raise _no_suite()
     chosen = load_suite(suite)
     _check_hides(chosen.observation == "masked", chosen.name)
     for name in options.keys() & OF_SINGLES:
@@ -300,6 +304,10 @@ def _extended(observation: Space, action: Space) -> Box:
     low = (*observation.low, *action.low, -np.inf, 0.0)
     high = (*observation.high, *action.high, np.inf, 1.0)
     return Box(np.array(low, np.float32), np.array(high, np.float32))
+
+
+def _no_suite() -> BidexError:
+    return BidexError('suite: expected a suite that hides its goals, got none. Name one: suite="ML1-v2".')
 
 
 def _check_hides(hides: bool, name: str) -> None:

@@ -98,8 +98,14 @@ def exported(policy: Any, shape: Json, metadata: dict[str, str]) -> tuple[bytes,
             ) from error
         wanted = network.eval_action(obs).numpy()
     network.low_precision = low_precision
-    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-    actions = session.run(None, {"observations": obs.numpy()})[0]
+    try:
+        session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+        actions = session.run(None, {"observations": obs.numpy()})[0]
+    except Exception as error:  # onnxruntime raises many kinds of errors
+        raise BidexError(
+            f"onnxruntime cannot play what torch has exported for {ROWS} observations: {one_line(error)[:200]}. Export "
+            "fails."
+        ) from error
     gap = float(abs(actions - wanted).max())
     if not gap <= TOLERANCE:
         raise BidexError(

@@ -230,7 +230,7 @@ def _is_complete(folder: Path) -> bool:
 
 
 def evaluate_every(steps: int, config: AnyConfig) -> int:
-    """Return the number of iterations between evaluations, for 100 evaluations of a run; at least 1."""
+    """Return the number of iterations between evaluations, for about 100 evaluations of a run; at least 1."""
     iteration = config.num_envs * config.learner_values["rollout_steps"]
     return max(1, steps // (_EVALUATIONS * iteration))
 

@@ -119,10 +119,20 @@ def transfer(
     return TransferResult(out, tuple(by_steps), tuple(by_demonstrations), failures)
 
 
+_EARLY = ("minutes", "stop_at_return", "stop_at_success", "stop_at_score")
+"""Entries of a config that may end a run before its steps are done."""
+
+
 def _planned(config: AnyConfig, final: FinalEvaluation, measured: RunFolder) -> AnyConfig:
     """Return the resolved config of all runs, on the suite of the run that is measured."""
     if config.algo != USUAL_RUN.algo:
         raise BidexError(f"transfer: config: expected the learner {USUAL_RUN.algo}, got {config.algo}.")
+    for name in _EARLY:
+        if getattr(config, name) is not None:
+            raise BidexError(
+                f"transfer: {name}: expected none, got {getattr(config, name)}, because curves are compared over the "
+                "same number of steps. Leave it out; --steps limits a run."
+            )
     planned = resolve(replace(config, suite=measured.config().suite, task=None, threads=1))
     check(planned)
     final.check(planned)

@@ -106,7 +106,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
     objects' states. `info` has `success` (1.0 or 0.0), `unscaled_reward` and `unstable` (physics broke: the episode is
     truncated). In version 1 `success` says whether the goal is met in this state. In version 2 success counts at the
     end of an episode, so that `success` is 0.0 before the last step. An episode is a success if any of its steps has
-    `success` 1.0.
+    `success` 1.0 and its physics did not break.
 
     The suite's randomisation applies to the classes in `train_classes`. `max_episode_steps` shortens the time limit of
     episodes; in version 2 success is then judged at this limit.

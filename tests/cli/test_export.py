@@ -66,6 +66,26 @@ def test_a_file_does_what_torch_does_for_any_number_of_rows(number: int, folder:
     torch.testing.assert_close(torch.from_numpy(actions), wanted, atol=1e-5, rtol=0.0)
 
 
+@pytest.mark.parametrize(("points", "size"), [(16, 48), (64, 192)])
+def test_files_of_policies_that_see_clouds_take_any_number_of_rows(points: int, size: int) -> None:
+    groups = (ObservationGroup("joints", (slice(0, 6),)), ObservationGroup("points", (slice(6, 6 + size),)))
+    shape = Shape(6 + size, 4, groups)
+    kind, drawn = learner_kind("mtppo"), torch.Generator().manual_seed(0)
+    config = replace(next(iter(kind.presets.values())), hidden=(8,))
+    made = kind.learner_class._make_policy(config, shape, drawn, torch.device("cpu"))  # type: ignore[attr-defined]
+    content, *_ = exported(made, shape.state_dict(), {})
+    obs = torch.randn(1500, 6 + size)  # the network computes so many clouds in parts
+    (actions,) = onnxruntime.InferenceSession(content).run(None, {"observations": obs.numpy()})
+    made.low_precision = False
+    torch.testing.assert_close(torch.from_numpy(actions), made.eval_action(obs), atol=1e-5, rtol=0.0)
+
+
+def test_a_file_that_onnxruntime_cannot_play_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(export, "_onnx", lambda *_: b"nothing")
+    with pytest.raises(BidexError, match="onnxruntime cannot play what torch has exported for 256 observations"):
+        exported(policy("bcq", hidden=(8, 8)), SHAPE.state_dict(), {})
+
+
 def test_no_rows_end_no_process(folder: Path) -> None:
     """Of any file that the test above has written."""
     files = sorted(map(str, folder.iterdir()))

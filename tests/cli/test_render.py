@@ -60,6 +60,13 @@ def test_a_policy_is_shown_with_the_object_of_its_run(flags, shown, tmp_path):
     assert looking.looked_at(LookFlags(run=run.path, **flags))[2] == shown
 
 
+@pytest.mark.parametrize(("flags", "switches"), [({}, "pyramids"), ({"task": "CatchAbreast-v2"}, "")])
+def test_a_policy_is_shown_with_the_physics_of_its_run(flags, switches, tmp_path):
+    config = resolve(RunConfig(task="CatchUnderarm-v2", switches="pyramids", algo="ppo", device="cpu"))
+    run = RunFolder.create(config, tmp_path / "run")
+    assert looking.looked_at(LookFlags(run=run.path, **flags))[0].switches == switches
+
+
 def test_a_run_is_filmed_with_all_its_classes_beside_each_other(monkeypatch, toy_class, tmp_path, capsys):
     monkeypatch.setattr(OwnSuite, "task_classes", lambda source: {"Near": None})
     monkeypatch.setattr(OwnSuite, "tasks", lambda source, split: {"Near": ["0"], "Far": ["0"]})

@@ -329,6 +329,8 @@ def test_bad_input_is_one_line_and_writes_nothing(trained: Path, tmp_path: Path,
         (["start", "--seeds", "0"], "--seeds"),
         (["start", "--workers", "100000"], "--workers"),
         (["start", "--", "--learner.gama", "1"], "Unknown flag --learner.gama of bidex-meta run"),
+        (["start", "--", "--minutes", "1"], "transfer: minutes: expected none, got 1.0"),
+        (["start", "--", "--stop-at-success", "0.5"], "transfer: stop_at_success: expected none, got 0.5"),
     ):
         error = refused("transfer", words[0], "--out", "t", *words[1:])
         assert message in error and error.count("\n") == 1 and not Path("t").exists()

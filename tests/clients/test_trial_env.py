@@ -202,7 +202,25 @@ def test_one_environment_and_a_world_show_the_same_after_broken_physics() -> Non
     assert np.array_equal(obs[-ACTIONS - 2 : -2], of_world["final_obs"][0, -ACTIONS - 2 : -2]) and obs[-2] != 0.0
 
 
+def test_an_episode_whose_physics_breaks_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = TrialEnv("ML1", episodes=1, seed=0)
+    env.reset()
+    single = env._env
+    monkeypatch.setattr(single, "step", lambda action: (*take(action)[:4], {**take_info, "success": 1.0}))
+    take = type(single).step.__get__(single)
+    take_info = {"unscaled_reward": 0.0, "unstable": False}
+    action = np.zeros(ACTIONS, np.float32)
+    env.step(action)
+    take_info["unstable"] = True
+    action[0] = np.nan
+    *_, info = env.step(action)
+    assert info["episode_success"] is False and info["is_success"] is False
+
+
 def test_what_is_no_trial_is_refused() -> None:
+    for make in (gymnasium.make, gymnasium.make_vec):
+        with pytest.raises(BidexError, match='Name one: suite="ML1-v2"'):
+            make("bidex-meta/trials")
     with pytest.raises(BidexError, match=r"Expected a suite that hides its goals.* MT4-v2 shows them"):
         TrialEnv("MT4-v2")
     with pytest.raises(BidexError, match="split"):
