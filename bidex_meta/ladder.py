@@ -74,16 +74,16 @@ class Rung(NamedTuple):
     hidden: str
     """Hidden part of a task, in words."""
     budget: str
-    """Estimate of a learner's training time. For most rungs docs/results/ladder.md has no measurement yet."""
+    """Training time of a learner that infers goals; docs/results/ladder.md has measurements for runs on one core."""
 
 
 RUNGS = (
-    Rung("one of two or four goals", "15 minutes on one core"),
-    Rung("one number", "45 minutes on one core"),
-    Rung("two numbers", "2 hours on one core"),
-    Rung("one or two numbers, several classes", "2 hours on one core"),
-    Rung("three numbers and more", "10 minutes of a GPU"),
-    Rung("all that version 2 hides", "hours of a GPU"),
+    Rung("one of two or four goals", "about 20 minutes on one core"),
+    Rung("one number", "about 30 minutes on one core"),
+    Rung("two numbers", "about an hour on one core"),
+    Rung("one or two numbers, several classes", "about 40 minutes on one core"),
+    Rung("three numbers and more", "not measured"),
+    Rung("all that version 2 hides", "hours on one core, with teachers"),
 )
 
 
