@@ -83,7 +83,7 @@ RUNGS = (
     Rung("two numbers", "about an hour on one core"),
     Rung("one or two numbers, several classes", "about 40 minutes on one core"),
     Rung("three numbers and more", "not measured"),
-    Rung("all that version 2 hides", "hours on one core, with teachers"),
+    Rung("all that version 2 hides", "about two hours on one core, with teachers"),
 )
 
 
