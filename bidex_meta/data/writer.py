@@ -116,7 +116,7 @@ class DatasetWriter:
 
     def commit(self) -> None:
         """Complete a part from the episodes and counts added since the last part, if there are any."""
-        if self._part is None and not self.left_out:
+        if self._part is None and not self.left_out.total():
             return
         self._open().commit(dict(self.left_out))
         self._part = None

@@ -80,7 +80,10 @@ class Engine(Protocol):
         ...
 
     def warnings(self) -> Tensor:
-        """Return how many kinds of warnings each simulation has had since its last reset. Shape (num,), int64."""
+        """Return how many kinds of warnings each simulation has had since its last reset. Shape (num,), int64.
+
+        mujoco_warp does not distinguish kinds: the number is 1 if the simulation broke, otherwise 0.
+        """
         ...
 
     def reset(self, mask: Tensor, start: Tensor) -> None:

@@ -134,23 +134,25 @@ class WarpEngine(Engine):
         self._overflow = views["overflow"]
         self._failed_view = wp.to_torch(self._guard.failed)
         self._stepped = [views[name] for name in _STEPPED if name in views] + [self._failed_view]
+        self._poses: tuple[Tensor, ...] = ()
         self._mocap = [views[name] for name in ("mocap_pos", "mocap_quat") if name in views]
         self._mask_view = wp.to_torch(self._mask)
         self._start_view = wp.to_torch(self._start)
 
     def step(self, substeps: int, active: Tensor | None = None) -> None:
         """Step all simulations; simulations outside the mask take the same time but keep their state."""
-        if active is None:
-            kept = []
-        else:
-            kept = [value.clone() for value in self._stepped]
+        stepped: list[Tensor] = []
+        kept: list[Tensor] = []
+        if active is not None:
+            stepped = [*self._stepped, *self._poses]
+            kept = [value.clone() for value in stepped]
         self._substeps = substeps
         name = f"step {substeps}"
         if name not in self._graphs:
             self._check_sums()
         self._play(name, self._advance)
         if active is not None:
-            for value, old in zip(self._stepped, kept, strict=True):
+            for value, old in zip(stepped, kept, strict=True):
                 value.copy_(torch.where(active.view(-1, *[1] * (value.dim() - 1)), value, old))
 
     def unstable(self) -> Tensor:
@@ -166,7 +168,9 @@ class WarpEngine(Engine):
         return self.unstable().long()
 
     def body_poses(self) -> tuple[Tensor, Tensor]:
-        return wp.to_torch(self._d.xpos), wp.to_torch(self._d.xmat)
+        poses = wp.to_torch(self._d.xpos), wp.to_torch(self._d.xmat)
+        self._poses = poses  # from now on they also stay where a simulation does not step
+        return poses
 
     def reset(self, mask: Tensor, start: Tensor) -> None:
         """Reset simulations; a start with a non-finite number makes its simulation unstable.

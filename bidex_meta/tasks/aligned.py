@@ -68,7 +68,7 @@ def aligned_terms(solved: Tensor, errors: list[Error], guides: list[Tensor]) -> 
     * ``near``: mean of exp(-0.3 e) over all errors, times 0.65, or times 0.5 if there are guides.
     * ``reach``: mean of 1 - tanh(3 d) over all guides, times 0.2; left out if there are none.
 
-    For an egg whose goal is x metres away, the means in ``far`` and ``near`` are 1 - tanh(2 x) and exp(-10 x).
+    For an egg whose goal is x metres away, the means in ``far`` and ``near`` are about 1 - tanh(2 x), and exp(-10 x).
     """
     off = torch.stack([error.value / error.tolerance for error in errors])
     far = (1.0 - torch.tanh(off / 16.0)).mean(dim=0)

@@ -28,7 +28,8 @@ final_obs              (N, d), float32       the observation to which the transi
                                              the last observation before it
 _final_obs             (N,), bool            environments whose episode ended in this step: their ``final_obs`` is the
                                              last observation of the episode; in all others ``final_obs`` is the
-                                             observation that the step returns
+                                             observation that the step returns (in NEXT_STEP not in the step that
+                                             begins an episode)
 running                dict of (N,)          the episode so far: r (return, float32), l (length, int64), success (by the
                                              suite's rule, bool; false where physics broke), unscaled (return of
                                              unscaled rewards, float32)
@@ -221,8 +222,8 @@ class EndlessWorld(Protocol):
     def fresh_tasks(self, number: int, count: int, /) -> dict[str, np.ndarray]:
         """Return ``count`` new tasks of each slot, for ``set_tasks``.
 
-        ``number`` (0, 1, ...) and the world's own seed determine the tasks; another number gives other tasks. None of
-        the tasks is in a pool of the suite.
+        ``number`` (0, 1, ...) and the seed with which the world was made determine the tasks; another number gives
+        other tasks. None of the tasks is in a pool of the suite.
         """
         ...
 

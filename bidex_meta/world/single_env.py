@@ -165,6 +165,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         self.terminate_on_success = False
         self._task: Task | None = None
         self._given: Task | None = None  # the task waits for the next reset
+        self._begun = False
         self._over = True
 
     @property
@@ -222,7 +223,12 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
             self._given = None
         if self._task is None:
             raise BidexError(f"{self.recipe.name}: expected set_task(task) before reset().")
-        obs, _ = self._world.reset(seed=int(self.np_random.integers(_FAR)))
+        drawn: int | None = int(self.np_random.integers(_FAR))
+        rule = self.recipe.randomisation
+        if self._begun and seed is None and rule is not None and rule.draw == "environment":
+            drawn = None  # the world draws on, and keeps what it has drawn for this environment
+        obs, _ = self._world.reset(seed=drawn)
+        self._begun = True
         self._over = False
         return _array(obs), {}
 

@@ -173,8 +173,12 @@ class World(BatchedWorld):
             cloud = (points.group, points.entries)
         self.observation_groups = observation_groups(layouts, width, self.num_id_columns, hidden, cloud)
         size = sum(group.size for group in self.observation_groups)
-        actions = max(slot.task_class.action_size for slot in self.slots)
-        self._set_spaces(Box(-CLIP, CLIP, (size,), np.float32), actions)
+        actions = {slot.name: slot.task_class.action_size for slot in self.slots}
+        if len({*actions.values()}) > 1:
+            raise BidexError(
+                f"Expected classes with one number of actions, got {actions}. Make all with moving_base=True."
+            )
+        self._set_spaces(Box(-CLIP, CLIP, (size,), np.float32), next(iter(actions.values())))
 
     def _randomised(self, rule: Randomisation) -> Randomiser:
         if rule.object_size != (1.0, 1.0) and (self.points or self._config.pixels):

@@ -130,6 +130,16 @@ def test_a_task_keeps_its_index_in_the_suites_pool_whatever_a_learner_plays() ->
     assert np.array_equal(episodes[-1].variation, pool[1] + 0.25)
 
 
+def test_nothing_is_committed_before_an_episode_ends(tmp_path: Path) -> None:
+    world = rough(mode="SAME_STEP", late=(0, 0, 0, 0, 0))
+    writer = DatasetWriter(tmp_path)
+    recorder = EpisodeCollector(world, writer.add, rows=[0])
+    recorder.reset(seed=0)
+    writer.left_out.update(recorder.left_out)
+    writer.commit()
+    assert writer.parts == 0 and not list(writer.folder.iterdir())
+
+
 def test_what_is_left_out_is_counted() -> None:
     world = rough(mode="SAME_STEP", breaks_at=((1, 0), (2, 3)), late=(0, 2, 0, 0, 0))
     found: list[Episode] = []

@@ -17,7 +17,8 @@ from bidex_meta import Benchmark, BidexError, load_suite, make_task_world
 from bidex_meta.engine.models import differing_fields
 from bidex_meta.rules import FACTORS, Randomisation
 from bidex_meta.suite_files import load_randomisation
-from bidex_meta.world import World
+from bidex_meta.tasks import registry
+from bidex_meta.world import Slot, World, WorldConfig
 from bidex_meta.worlds import open_worlds
 from tests.world.play import assert_same, engine_state, flat, number_of_ends, play, random_actions
 from tests.world.test_graphs import recorded  # noqa: F401  (a fixture)
@@ -148,6 +149,26 @@ def test_per_episode_or_per_environment() -> None:
             assert draw == "environment" or name == "action_delay" or not bool(same[1])
         world.reset(seed=1)
         assert not torch.equal(world.randomised["friction"], first["friction"])
+
+
+def test_single_environments_keep_what_is_drawn_once_until_they_are_seeded() -> None:
+    for draw, kinds in (("episode", 3), ("environment", 1)):
+        suite = replace(load_suite("MT1"), randomisation=Randomisation(friction=(0.5, 1.5), draw=draw))
+        benchmark = Benchmark(suite)
+        env = benchmark.train_classes["CatchUnderarm"]()
+        env.set_task(benchmark.train_tasks[0])
+        found = []
+        for seed in (0, None, None, 0, 1):
+            env.reset(seed=seed)
+            found.append(float(env._world.randomised["friction"][0]))
+        assert len({*found[:3]}) == kinds and found[3] == found[0] and found[4] != found[0]
+
+
+def test_a_mixture_of_moving_and_fixed_hands_is_refused() -> None:
+    found = {"a": registry.get("HandOver", False), "b": registry.get("CatchUnderarm", True)}
+    slots = [Slot(name, task, task.variation_space.sample(np.random.default_rng(0), 1)) for name, task in found.items()]
+    with pytest.raises(BidexError, match=r"one number of actions, got \{'a': 40, 'b': 52\}"):
+        World(slots, WorldConfig(num_envs=2, threads=1))
 
 
 def test_neither_threads_nor_rows_nor_the_way_of_resets_change_a_draw(

@@ -44,11 +44,11 @@ class DAggerConfig(NetworkConfig):
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """Estimate the memory that the learner takes, in bytes, if it stores ``width`` numbers per environment step."""
-        return self.bytes_stored(num_envs, width) + network_bytes(self.hidden, width, 1)
+        return self.samples * width + network_bytes(self.hidden, width, 1)  # width counts two observations
 
     def bytes_stored(self, num_envs: int, width: int) -> int:
-        """Estimate the bytes of all labelled observations, if ``width`` numbers are stored per environment step."""
-        return self.samples * width
+        """Estimate the bytes of all labelled observations in float16, with ``width`` numbers each."""
+        return 2 * self.samples * width
 
 
 PRESETS: dict[str, DAggerConfig] = {"laptop": DAggerConfig()}

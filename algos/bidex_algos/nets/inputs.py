@@ -111,7 +111,7 @@ class GroupEncoder(nn.Module):
     """Encodes observations (..., d) as the input (..., size) of a network's layers.
 
     Groups without an encoder come first, in the order of their columns, followed by groups with an encoder. Without any
-    encoder the module is the identity and has no weights.
+    encoder the module has no weights.
     """
 
     def __init__(self, inputs: int | Inputs, generator: torch.Generator):
