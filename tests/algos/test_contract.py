@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 import torch
 
-from bidex_algos.rollout import EpisodeStatistics
+from bidex_algos import rollout as rollout_module
+from bidex_algos.rollout import EpisodeStatistics, Rollout, collect_rollout
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import ZeroAgent
 from bidex_meta.experiments.learners import ALGOS, learner_kind
@@ -15,7 +16,7 @@ from bidex_meta.training.learner import Capability, Sources
 from bidex_meta.witness.teachers import Teachers, Tutor
 from bidex_meta.world.contract import plain_groups
 from tests.algos.families import Passing, PointClass, PointGoals
-from tests.algos.problems import opposite_bandits
+from tests.algos.problems import LQR, opposite_bandits
 from tests.algos.ranks import resumed, same
 from tests.algos.toy import ToyWorld, nearness
 from tests.fakes import run_config
@@ -254,3 +255,36 @@ def test_means_over_tasks_wait_for_every_task():
     assert set(statistics.metrics()) == {"Train/return/fast", "Train/success/fast"}
     statistics.update({"running": episode, "episode_mask": torch.tensor([False, True])})
     assert statistics.metrics()["Train/success_rate"] == 0.5
+
+
+def test_means_are_of_the_newest_episodes():
+    statistics = EpisodeStatistics(torch.tensor([0]), ["one"], window=4.0)
+    for success in [False] * 10 + [True] * 10:
+        episode = {"r": torch.zeros(1), "l": torch.ones(1), "success": torch.tensor([success])}
+        statistics.update({"running": episode, "episode_mask": torch.tensor([True])})
+    new, old = 1.0 - 0.75**10, 0.75**10 * (1.0 - 0.75**10)  # sums of a geometric series, times 0.25
+    assert statistics.metrics()["Train/success_rate"] == pytest.approx(new / (new + old), rel=1e-5)
+
+
+@pytest.mark.parametrize("may_look", [True, False])
+def test_an_episode_that_time_cuts_is_worth_its_own_last_observation(may_look: bool, monkeypatch):
+    monkeypatch.setattr(rollout_module.maths, "may_look", lambda device: may_look)
+    world = LQR(rows=3, horizon=4)
+    rollout = Rollout(10, 3, 2, 2, torch.device("cpu"))
+    steps: list[tuple[torch.Tensor, torch.Tensor]] = []
+    step = world.step
+
+    def recorded(action: torch.Tensor) -> Any:
+        result = step(action)
+        steps.append((result[3] & ~result[2], result[4]["final_obs"][:, 0]))
+        return result
+
+    monkeypatch.setattr(world, "step", recorded)
+    obs, _ = world.reset(seed=0)
+    statistics = EpisodeStatistics(world.task_id, world.task_names)
+    act = torch.full((3, 2), 0.1)
+    collect_rollout(world, rollout, obs, lambda obs: (act, act), lambda obs, task: obs[:, 0], statistics)
+    cut = torch.stack([each for each, _ in steps])
+    assert cut.any() and not cut.all()
+    expected = torch.where(cut, torch.stack([last for _, last in steps]), 0.0)
+    assert torch.equal(rollout.final_values, expected)

@@ -15,7 +15,7 @@ from bidex_algos.offpolicy.brc import BRC, BRCConfig, ResidualMLP
 from bidex_algos.offpolicy.categorical import Atoms, ReturnBound
 from bidex_algos.offpolicy.fasttd3 import FastTD3, FastTD3Config
 from bidex_algos.replay import Replay, Stretches, Transitions
-from tests.algos.problems import LQR, OFF_POLICY, a_draw, opposite_bandits, shake, trained
+from tests.algos.problems import OFF_POLICY, a_draw, opposite_bandits, shake, trained
 from tests.algos.toy import ToyWorld, nearness
 
 
@@ -263,7 +263,3 @@ def test_wide_critics_are_counted_as_memory(kind: Any, config: Any) -> None:
     wide = replace(config, critic_hidden=(4096, 4096, 4096))
     # These are two critics with two more matrices of 4096 by 4096 each, with gradient and two moments, in float32.
     assert wide.bytes_held(64, 500) - config.bytes_held(64, 500) > 2 * 2 * 4096**2 * 4 * 4
-
-
-def test_one_task_needs_no_embedding() -> None:
-    trained(BRC, LQR(rows=4), SMALL, 1)

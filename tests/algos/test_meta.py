@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch.distributions import Independent, Normal, kl_divergence
 from torch.func import functional_call
 from torch.testing import assert_close
 
@@ -85,8 +86,9 @@ def test_first_order_leaves_the_second_derivatives_out(kind: Any, config: Any):
     assert_close(gradients[1], torch.cat([slope.sum(0).flatten() for slope in slopes]))
 
 
-def test_a_promp_step_without_kl_equals_an_independent_computation():
-    config = replace(PROMP, kl_weight=0.0, inner_learning_rate=0.2, outer_epochs=1, max_grad_norm=1e9)
+@pytest.mark.parametrize("kl_weight", [0.0, 0.3])
+def test_a_promp_step_equals_an_independent_computation(kl_weight: float):
+    config = replace(PROMP, kl_weight=kl_weight, inner_learning_rate=0.2, outer_epochs=1, max_grad_norm=1e9)
     learner, [before, after] = tiny(ProMP, config)
     actor = learner.policy.actor
     start = [p.detach().clone().requires_grad_() for p in actor.parameters()]
@@ -97,18 +99,26 @@ def test_a_promp_step_without_kl_equals_an_independent_computation():
         mean = torch.tanh(obs @ p[1].T + p[2]) @ p[3].T + p[4]
         return -0.5 * (((actions - mean) / p[0].exp()) ** 2 + 2 * p[0] + np.log(2 * np.pi)).sum(-1)
 
+    def moved(p: list[Tensor], batch: TaskBatch, k: int) -> Tensor:
+        old = Independent(Normal(batch.old_means[k], batch.old_log_stds[k].exp()), 1)
+        mean = torch.tanh(batch.obs[k] @ p[1].T + p[2]) @ p[3].T + p[4]
+        divergence = kl_divergence(old, Independent(Normal(mean, p[0].exp().expand_as(mean)), 1))
+        return (batch.weights[k] * divergence).sum() / batch.weights[k].sum()
+
     total = torch.zeros((), dtype=torch.float64)
+    kl = torch.zeros((), dtype=torch.float64)
     for k in range(3):
         old = gaussian_log_prob(before.actions[k], before.old_means[k], before.old_log_stds[k])
         ratio = torch.exp(log_prob(start, before.obs[k], before.actions[k]) - old)
         inner = (before.weights[k] * ratio * before.advantages[k]).sum() / before.weights[k].sum()
+        kl = kl + moved(start, before, k) / 3
         slopes = torch.autograd.grad(inner, start, create_graph=True)
         adapted = [p + 0.2 * s for p, s in zip(start, slopes, strict=True)]
         old = gaussian_log_prob(after.actions[k], after.old_means[k], after.old_log_stds[k])
         ratio = torch.exp(log_prob(adapted, after.obs[k], after.actions[k]) - old)
         kept = torch.min(ratio * after.advantages[k], ratio.clamp(0.7, 1.3) * after.advantages[k])
         total = total + (after.weights[k] * kept).sum() / after.weights[k].sum() / 3
-    slopes = torch.autograd.grad(-total, start)
+    slopes = torch.autograd.grad(kl_weight * kl - total, start)
     expected = [p - 1e-3 * s / (s.abs() + 1e-8) for p, s in zip(start, slopes, strict=True)]
 
     told = learner._outer([before, after])
@@ -321,3 +331,27 @@ def test_adaptation_of_all_tasks_equals_a_loop_over_them(objective: Any, adapted
                 assert_close(moved[name][k], p + rate * slope, rtol=1e-5, atol=1e-5)
         params = moved
     assert not torch.equal(params["mean.head.bias"][0], params["mean.head.bias"][1])
+
+
+@both
+def test_a_second_shot_adapts_what_the_first_has_adapted(kind: Any, config: Any):
+    config = replace(config, hidden=(5,), inner_learning_rate=0.3, max_adapt_steps=None)
+    world = PointGoals(rows=3, classes=(PointClass(count=3),))
+    agent = kind.load_policy(kind(world, config, seed=0).policy_state_dict())
+    agent.init()
+    found, given = [], []
+    adapt = agent.adapter.adapt
+
+    def recorded(params: Any, batch: TaskBatch) -> Any:
+        given.append(({name: value.clone() for name, value in params.items()}, batch.obs.shape[1]))
+        found.append(adapt(params, batch))
+        return found[-1]
+
+    agent.adapter.adapt = recorded
+    for _ in range(2):
+        shot(agent, world)
+        assert len(agent.stage) == 0
+    (_, first), (start, second) = given
+    assert first == second, "the second batch holds the second shot alone"
+    for name, value in start.items():
+        assert_close(value, found[0][name])

@@ -10,6 +10,7 @@ from torch.func import grad
 from torch.testing import assert_close
 
 from bidex_algos.nets import products
+from bidex_algos.nets.architecture import follow
 from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import GaussianActor, gaussian_entropy, gaussian_kl, gaussian_log_prob, use_bfloat16
 from bidex_algos.nets.normalise import RunningStats, TaskNormaliser
@@ -253,3 +254,12 @@ def test_own_heads_are_those_of_all_heads(tasks):
         assert_close(one, other)
     alone = x[1:2]
     assert_close(actor(alone), actor(x)[1:2])
+
+
+def test_a_target_network_follows_by_a_share_of_the_way():
+    target, network = torch.nn.Linear(1, 1), torch.nn.Linear(1, 1)
+    torch.nn.init.zeros_(target.weight)
+    torch.nn.init.ones_(network.weight)
+    for expected in (0.1, 0.19):
+        follow(target, network, 0.1)
+        assert target.weight.item() == pytest.approx(expected) and network.weight.item() == 1.0

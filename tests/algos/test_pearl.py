@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch.distributions import Independent, Normal, kl_divergence
 from torch.testing import assert_close
 
 from bidex_algos.meta.latent_agent import LatentAgent
@@ -144,3 +145,32 @@ def test_an_update_learns_from_all_environments_of_the_chosen_tasks() -> None:
 def test_tasks_without_an_environment_are_refused() -> None:
     with pytest.raises(BidexError, match=r"Short has 3 tasks and 2 environments.* Raise num_envs to 6"):
         learner_on(rows=4)
+
+
+def test_critics_learn_from_the_next_observation_and_the_encoder_from_its_divergence(monkeypatch: pytest.MonkeyPatch):
+    config = replace(TINY, warmup_steps=10, steps_per_iteration=40, gamma=0.7)
+    learner = PEARL(PointGoals(8, autoreset_mode="SAME_STEP"), config, seed=0)
+    found: dict[str, Any] = {}
+
+    def recorded(name: str) -> None:
+        method = getattr(learner, name)
+
+        def record(*given: Any) -> Any:
+            result = method(*given)
+            found[name] = given, result
+            return result
+
+        monkeypatch.setattr(learner, name, record)
+
+    for name in ("_sample", "_target", "_fit_critics"):
+        recorded(name)
+    learner.iterate()
+    (mean, std), latent = found["_sample"]
+    (draw, following), _ = found["_target"]
+    beside = found["_fit_critics"][0][5]
+    of_draw = latent[learner.which].detach()
+    assert not torch.equal(draw.obs, draw.next_obs)
+    assert_close(following, learner.policy.seen(draw.next_obs, of_draw))
+    prior = Independent(Normal(torch.zeros_like(mean), torch.ones_like(mean)), 1)
+    expected = kl_divergence(Independent(Normal(mean, std), 1), prior).mean()
+    assert_close(beside, config.kl_weight * expected)

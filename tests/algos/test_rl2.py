@@ -127,6 +127,17 @@ def test_rewards_are_shown_but_for_blind_episodes():
     assert x[1, 6:].tolist() == [0.0, 0.0, 0.0] and x[0, 7:].tolist() == [1.0, 1.0] and x[0, 6] != 0.0
 
 
+def test_chunks_begin_with_the_memory_that_the_trial_had_there(monkeypatch: pytest.MonkeyPatch):
+    learner = RL2(PointGoals(16, classes=TEN), replace(TINY, num_minibatches=1), seed=0)
+    learner.iterate()  # from now on the policy differs from its beginning
+    found: list[Tensor] = []
+    gradients = learner._gradients
+    monkeypatch.setattr(learner, "_gradients", lambda *given: found.append(gradients(*given)) or found[-1])
+    learner.iterate()
+    assert learner.config.trial_steps is None or learner.config.chunk < 30
+    assert abs(float(found[0][2])) < 1e-8, "before the first step, policy and sampling policy are equal"
+
+
 def test_classes_with_more_tasks_than_rows_take_them_by_turns():
     world = PointGoals(6, classes=(PointClass("Few", steps=2, count=2), PointClass("Many", steps=2, count=5)))
     learner, goals = RL2(world, TINY, seed=0), []

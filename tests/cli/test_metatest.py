@@ -154,6 +154,7 @@ def test_while_training_an_adapting_learner_is_judged_after_a_shot_on_train_task
     rows = RunFolder.open(tmp_path / "r").metrics()
     assert ["Eval/success_rate" in row for row in rows] == [False, True, False]
     assert rows[1]["Eval/success_rate"] > rows[1]["Eval/success_before_adapt"]
+    assert "Eval/success/Far" in rows[1], "no test task is of this class"
     assert (tmp_path / "r" / "checkpoints" / "best.pt").is_file()
 
 

@@ -64,16 +64,6 @@ def test_stored_references_are_those_of_moving_bases(name: str, known: bool) -> 
 
 
 @pytest.mark.parametrize("name", registry.names())
-def test_an_agent_that_knows_nothing_scores_nothing(name: str) -> None:
-    """Random actions and no actions at all, by the returns that are stored of them."""
-    known = references.references()[name]
-    for kind in ("random", "zero"):
-        scores = known.scores(np.array([references.load(kind)[name]["return"]]))
-        assert scores is None or scores[0] <= 1.0
-    assert known.expert is None or known.scores(np.array([known.expert])) == pytest.approx(100.0)
-
-
-@pytest.mark.parametrize("name", registry.names())
 def test_the_score_of_version_2_needs_no_expert(name: str) -> None:
     """References of version 2 are stored, and an untrained policy gets less than the reward of every step."""
     task = registry.get(f"{name}-v2", moving_base=True)
