@@ -12,8 +12,9 @@ from bidex_meta.experiments.metatest import Adaptation, rollouts_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.training.learner import Capability
 from bidex_meta.worlds import open_worlds
+from bidex_meta.worlds.own import OwnSuite
 from tests.adapting_learner import Learner
-from tests.cli.conftest import COUNTS, FINDER
+from tests.cli.conftest import COUNTS, FINDER, points
 from tests.fakes import change, run_config
 
 pytestmark = pytest.mark.usefixtures("finder")
@@ -146,6 +147,18 @@ def test_where_rows_share_nothing_each_plays_one_episode_a_shot(monkeypatch):
     monkeypatch.setattr(Learner, "capabilities", frozenset(Capability))
     alone = Adaptation.of(source, config)
     assert [rollouts_of(alone, asked, 6) for asked in (20, None, 4)] == [6, 6, 4]
+
+
+def test_unseen_tasks_are_those_of_another_seed_and_of_the_test_split(adapted, shown, monkeypatch):
+    played = set()
+
+    def recorded(source, split="train", rows=None, mode="DISABLED"):
+        played.add((split, source.seed))
+        return points(source, split, rows, mode)
+
+    monkeypatch.setattr(OwnSuite, "world", recorded)
+    shown("evaluate", adapted, "--json", "--split", "unseen")
+    assert played == {("train", 500_000), ("test", 0)}
 
 
 def test_while_training_an_adapting_learner_is_judged_after_a_shot_on_train_tasks(tmp_path):
