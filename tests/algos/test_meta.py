@@ -355,3 +355,12 @@ def test_a_second_shot_adapts_what_the_first_has_adapted(kind: Any, config: Any)
     assert first == second, "the second batch holds the second shot alone"
     for name, value in start.items():
         assert_close(value, found[0][name])
+
+
+@pytest.mark.parametrize("outer", ["adam", "trpo"])
+def test_an_outer_step_of_maml_raises_its_objective(outer: Any):
+    config = replace(MAML_TRPO, outer=outer, outer_learning_rate=1e-4, inner_learning_rate=0.3)
+    learner, batches = tiny(MAML, config)
+    before = float(learner._objective(batches)[0].detach())
+    learner._outer(batches)
+    assert float(learner._objective(batches)[0].detach()) > before + 1e-7
