@@ -357,9 +357,8 @@ def test_a_second_shot_adapts_what_the_first_has_adapted(kind: Any, config: Any)
         assert_close(value, found[0][name])
 
 
-@pytest.mark.parametrize("outer", ["adam", "trpo"])
-def test_an_outer_step_of_maml_raises_its_objective(outer: Any):
-    config = replace(MAML_TRPO, outer=outer, outer_learning_rate=1e-4, inner_learning_rate=0.3)
+def test_an_outer_step_of_maml_by_adam_raises_its_objective():
+    config = replace(MAML_TRPO, outer="adam", outer_learning_rate=1e-4, inner_learning_rate=0.3)
     learner, batches = tiny(MAML, config)
     before = float(learner._objective(batches)[0].detach())
     learner._outer(batches)
