@@ -104,7 +104,7 @@ def test_the_difference_to_a_policy_in_bfloat16_is_told(shown, tmp_path: Path, m
     monkeypatch.setattr(export, "exported", lambda *_: (b"file", 7e-6, 0.038))
     told = shown("export", trained_run("mtppo"), "--out", tmp_path / "policy.onnx")
     assert "within 7e-06 of torch in float32" in told
-    assert "policy computes in bfloat16: its actions are up to 0.04 away" in told
+    assert "policy computes in bfloat16: on these observations its actions are up to 0.04 away" in told
 
 
 def test_a_policy_whose_file_would_differ_is_refused() -> None:
