@@ -164,8 +164,8 @@ class OpenPenCap(ReachTask):
     which is 13 cm long, has been pulled by its own length. The goal position, for the cap's point, is 0.3 m from the
     place of the body's point at the task's start. The goal orientation is the pen's orientation at the task's start.
     Reward and success do not read this goal pose. With wide variation, as in version 2, each task has its own distance
-    between the points instead of 0.3 m, and every episode places the pen anew. The goal pose is then that of a pen at
-    its nominal place, so it tells the distance but not where this pen lies.
+    between the points instead of 0.3 m, and the pen starts at another place in every episode. The goal pose is then
+    computed for a pen at the nominal place: it shows the distance, but not where the pen lies.
     """
 
     needs = Capacity(56, 0, 121)

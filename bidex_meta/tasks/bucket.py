@@ -210,8 +210,8 @@ class PourWater(ReachTask):
     sinking goal if the kettle is tilted over the rim. At less than 30 degrees of tilt no water leaves, and the spout
     stays 3 cm away from the goal. At 40 degrees it is 2 cm away, and from 60 degrees on it reaches the goal. The goal's
     orientation is the kettle's orientation at the task's start, tilted by 40 degrees towards the spout. With wide
-    variation, as in version 2, every episode places kettle and bucket anew: the goal's position is the place on the
-    table where the task wants the bucket, and its orientation that of a tilted kettle at its nominal place.
+    variation, as in version 2, kettle and bucket start at other places in every episode. The goal's position is then
+    the goal of the bucket on the table, and its orientation is computed for a kettle at the nominal place.
 
     A task shifts and turns the bucket, and the kettle with the water. The water consists of drops without friction, of
     5 mm radius; observations do not show the drops. With twelve drops, the default, physics takes 1.4 times as long as

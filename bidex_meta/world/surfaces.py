@@ -292,8 +292,8 @@ def sample(model: mujoco.MjModel, count: int, seed: int = 0) -> Surfaces:
 def _portions(areas: np.ndarray, kinds: np.ndarray, count: int) -> np.ndarray:
     """Return the number of points of each geom, (geoms,); the sum is ``count``.
 
-    ``areas`` (m²) leave out what is buried in other geoms. A geom with an area gets at least one
-    point, unless ``count`` is hardly larger than the number of geoms.
+    ``areas`` (m²) leave out what is buried in other geoms. A geom with an area gets at least one point,
+    unless ``count`` is hardly larger than the number of geoms.
     """
     shares = np.zeros(len(areas))
     for kind, share in _SHARES.items():

@@ -262,7 +262,8 @@ def test_means_are_of_the_newest_episodes():
     for success in [False] * 10 + [True] * 10:
         episode = {"r": torch.zeros(1), "l": torch.ones(1), "success": torch.tensor([success])}
         statistics.update({"running": episode, "episode_mask": torch.tensor([True])})
-    new, old = 1.0 - 0.75**10, 0.75**10 * (1.0 - 0.75**10)  # sums of a geometric series, times 0.25
+    new = 1.0 - 0.75**10  # this and the next are sums of a geometric series, times 0.25
+    old = 0.75**10 * new
     assert statistics.metrics()["Train/success_rate"] == pytest.approx(new / (new + old), rel=1e-5)
 
 

@@ -339,7 +339,8 @@ def test_a_second_shot_adapts_what_the_first_has_adapted(kind: Any, config: Any)
     world = PointGoals(rows=3, classes=(PointClass(count=3),))
     agent = kind.load_policy(kind(world, config, seed=0).policy_state_dict())
     agent.init()
-    found, given = [], []
+    found = []
+    given = []
     adapt = agent.adapter.adapt
 
     def recorded(params: Any, batch: TaskBatch) -> Any:

@@ -257,7 +257,8 @@ def test_own_heads_are_those_of_all_heads(tasks):
 
 
 def test_a_target_network_follows_by_a_share_of_the_way():
-    target, network = torch.nn.Linear(1, 1), torch.nn.Linear(1, 1)
+    target = torch.nn.Linear(1, 1)
+    network = torch.nn.Linear(1, 1)
     torch.nn.init.zeros_(target.weight)
     torch.nn.init.ones_(network.weight)
     for expected in (0.1, 0.19):

@@ -25,14 +25,14 @@ GROUPS = {"joints": [(0, 6)], "object": [(6, 9), (11, 13)], "goal": [(9, 11)], "
 SHAPE = Shape(16, 4, tuple(ObservationGroup(name, tuple(slice(*w) for w in where)) for name, where in GROUPS.items()))
 
 
-def policy(algo: str, **options: object) -> torch.nn.Module:
+def policy(algo: str, shape: Shape = SHAPE, **options: object) -> torch.nn.Module:
     """A policy with statistics and weights of its own."""
     kind, drawn = learner_kind(algo), torch.Generator().manual_seed(0)
     config = replace(next(iter(kind.presets.values())), **options)
-    made = kind.learner_class._make_policy(config, SHAPE, drawn, torch.device("cpu"))  # type: ignore[attr-defined]
+    made = kind.learner_class._make_policy(config, shape, drawn, torch.device("cpu"))  # type: ignore[attr-defined]
     for weight in made.parameters():
         weight.data.add_(0.1 * torch.randn(weight.shape, generator=drawn))
-    made.observations.update(3.0 * torch.randn(64, 16, generator=drawn) + 1.0)
+    made.observations.update(3.0 * torch.randn(64, shape.observations, generator=drawn) + 1.0)
     return made
 
 
@@ -70,14 +70,13 @@ def test_a_file_does_what_torch_does_for_any_number_of_rows(number: int, folder:
 def test_files_of_policies_that_see_clouds_take_any_number_of_rows(points: int, size: int) -> None:
     groups = (ObservationGroup("joints", (slice(0, 6),)), ObservationGroup("points", (slice(6, 6 + size),)))
     shape = Shape(6 + size, 4, groups)
-    kind, drawn = learner_kind("mtppo"), torch.Generator().manual_seed(0)
-    config = replace(next(iter(kind.presets.values())), hidden=(8,))
-    made = kind.learner_class._make_policy(config, shape, drawn, torch.device("cpu"))  # type: ignore[attr-defined]
+    made = policy("mtppo", shape, hidden=(8,))
     content, *_ = exported(made, shape.state_dict(), {})
-    obs = torch.randn(1500, 6 + size)  # the network computes so many clouds in parts
+    obs = torch.randn(1500, 6 + size)  # so many clouds that torch's network splits them
     (actions,) = onnxruntime.InferenceSession(content).run(None, {"observations": obs.numpy()})
     made.low_precision = False
-    torch.testing.assert_close(torch.from_numpy(actions), made.eval_action(obs), atol=1e-5, rtol=0.0)
+    wanted = made.eval_action(obs)  # type: ignore[operator]
+    torch.testing.assert_close(torch.from_numpy(actions), wanted, atol=1e-5, rtol=0.0)
 
 
 def test_a_file_that_onnxruntime_cannot_play_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -206,12 +206,12 @@ def test_an_episode_whose_physics_breaks_is_no_success(monkeypatch: pytest.Monke
     env = TrialEnv("ML1", episodes=1, seed=0)
     env.reset()
     single = env._env
-    monkeypatch.setattr(single, "step", lambda action: (*take(action)[:4], {**take_info, "success": 1.0}))
-    take = type(single).step.__get__(single)
-    take_info = {"unscaled_reward": 0.0, "unstable": False}
+    step = single.step
+    told = {"success": 1.0, "unscaled_reward": 0.0, "unstable": False}
+    monkeypatch.setattr(single, "step", lambda action: (*step(action)[:4], dict(told)))
     action = np.zeros(ACTIONS, np.float32)
     env.step(action)
-    take_info["unstable"] = True
+    told["unstable"] = True
     action[0] = np.nan
     *_, info = env.step(action)
     assert info["episode_success"] is False and info["is_success"] is False
