@@ -8,13 +8,14 @@ import pytest
 
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
+from bidex_meta.worlds import open_worlds
 from tests.pages import ROOT
 from tests.tools import test_collect
 from tests.tools.test_collect import collect, evaluated
 from tools.pages.blocks import fill, filled_pages
 from tools.pages.studies import bars_figure, read_studies
 from tools.pages.tables import arms_table, best_table, classes_table
-from tools.pages.validity import validity_table
+from tools.pages.validity import read_validity, validity_table
 
 no_weights = test_collect.no_weights
 
@@ -90,6 +91,22 @@ def test_a_mean_over_fewer_classes_says_how_many(tmp_path: Path) -> None:
     found = dict(zip(head, mean, strict=True))
     assert (found["blind at best"], found["named by its start"], found["zero"]) == ("50.0 %", "10.0 %", "")
     assert (found["knowing the task"], found["rank"]) == ("50.0 % (1 of 2)", "0.75 (1 of 2)")
+
+
+def test_teachers_stand_with_what_noise_costs_them(tmp_path: Path) -> None:
+    (tmp_path / "validity").mkdir()
+    row = {"teacher": "scripts", "own": 0.94, "unseen": 0.88, "noise": 0.6}
+    (tmp_path / "validity" / "teachers.json").write_text(json.dumps({"classes": {"PourWater": row}}))
+    (page := tmp_path / "page.md").write_text("<!-- results: show=teachers -->\n<!-- end -->")
+    fill(page, tmp_path / "data")
+    *_, found = [cells(line) for line in page.read_text().splitlines() if line.startswith("|")]
+    assert found == ["PourWater", "scripts", "94 %", "88 %", "60 %", "34 points"]
+
+
+def test_the_repository_has_a_teacher_of_every_class() -> None:
+    rows = read_validity(ROOT / "results", "teachers")
+    assert rows.keys() == open_worlds({"suite": "MT20-v2"}).task_classes().keys()
+    assert all(row["own"] >= 0.8 and row["unseen"] >= 0.8 for row in rows.values())
 
 
 @pytest.fixture

@@ -29,7 +29,7 @@ from tools.pages.offline import offline_table
 from tools.pages.pretrained import pretrained_table
 from tools.pages.scaling import rows_figure, rows_table
 from tools.pages.studies import bars_figure, curves_figure, digest_of, read_studies
-from tools.pages.validity import validity_table
+from tools.pages.validity import teachers_table, validity_table
 
 _BLOCK = re.compile(r"(?P<head><!-- results: (?P<words>[^\n]*?) -->\n).*?(?P<end><!-- end -->)", re.DOTALL)
 _TABLES = {
@@ -44,6 +44,7 @@ _TABLES = {
 }
 _WITHOUT_STUDY = {
     "gpu": gpu_table,
+    "teachers": teachers_table,
     "validity": validity_table,
     "leaderboard": leaderboard_table,
     "pretrained": pretrained_table,

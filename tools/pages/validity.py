@@ -1,11 +1,12 @@
 """Tables of the results of ``bidex-meta validity``."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from bidex_meta.errors import BidexError
 from bidex_meta.utils.files import Json
+from tools.pages.tables import table
 
 _SHARES = {
     "blind": "blind at best",
@@ -43,11 +44,25 @@ def validity_table(suite: str, data: Path) -> list[str]:
     return [*lines, f"| mean | | {' | '.join(means)} | |"]
 
 
+def teachers_table(on: str, data: Path) -> Iterator[str]:
+    """Yield a table of the teachers of ``validity/teachers.json`` next to the folder of data, with a row per class.
+
+    ``on`` is not used. Raises BidexError if there is no such file.
+    """
+    head = ("class", "teacher", "own tasks", "unseen tasks", "own tasks, noise", "lost to noise")
+    rows = []
+    for name, row in read_validity(data.parent, "teachers").items():
+        lost = f"{100 * (row['own'] - row['noise']):.0f} points"
+        rows.append([name, row["teacher"], *(f"{100 * row[key]:.0f} %" for key in ("own", "unseen", "noise")), lost])
+    yield from table(head, rows)
+
+
 def read_validity(results: Path, suite: str) -> Json:
     """Return what ``bidex-meta validity`` stored of a suite in the folder ``results``, by class; raise BidexError."""
     file = results / "validity" / f"{suite}.json"
     if not file.is_file():
-        raise BidexError(f"Expected {file}. Make it: bidex-meta validity --suite {suite} --out {file}")
+        command = "python -m tools.teachers" if suite == "teachers" else f"bidex-meta validity --suite {suite}"
+        raise BidexError(f"Expected {file}. Make it: {command} --out {file}")
     classes: Json = json.loads(file.read_text())["classes"]
     return classes
 

@@ -11,16 +11,18 @@ from bidex_meta.witness.scripts.between import ramp
 
 _LEVER = 0.035  # distance in metres from a rocker's hinge to its button
 _CLEAR = 0.04  # height of a fingertip that is clear of its button, metres
-# Angles before the requested one at which a finger begins to rise, and from which on it rises at full speed, rad. The
-# finger still presses while it rises.
-_ENOUGH = 0.045, 0.02
+# Angles before the requested one at which a finger begins to rise, and from which on it rises at full speed, rad. A
+# rocker that is pressed too far does not come back, so both count from where the rocker will be after _LAG seconds: the
+# finger still presses while it begins to rise.
+_ENOUGH = 0.045, 0.025
+_LAG = 0.03
 
 
 def press_switches(hands: HandController) -> Actions:
-    """Press each button with a fingertip until its rocker has the requested angle, and rise again."""
+    """Press each button with the middle finger until its rocker has the requested angle, and rise again."""
     wanted = hands.frozen("angles").tolist()[::-1]
     for side in SIDES:
-        hands.bend(side, 0.9, 0.5, THJ3=0.5)
+        hands.bend(side, 0.0, 0.0, MFJ2=0.9, MFJ1=0.5, THJ3=0.5)
         hands.hold(side)
     while hands.steps_left:
         points: list[Point] = []
@@ -33,8 +35,9 @@ def press_switches(hands: HandController) -> Actions:
                 press = above[2] - height
             else:
                 press = -min(0.004, max(0.002, 0.8 * _LEVER * (left - 0.03)))
-            rise = min(0.03, above[2] + 0.1 - height)
-            height += press + ramp(left, *_ENOUGH) * (rise - press)
+            soon = left - _LAG * float(hands.where(f"{name}/angular_velocity").norm())
+            rise = min(0.08, above[2] + 0.1 - height)
+            height += press + ramp(soon, *_ENOUGH) * (rise - press)
             points.append((above[0], above[1], height))
         yield from hands.lead_each(points, 1.2)
 
