@@ -115,7 +115,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_command_lines_parse(line: str, page: str, run: Path, folder: Path) -> None:
     plain = re.sub(r"\|\d+", "", line.partition(" > ")[0]).replace("cuda:0", "cpu")
     plain = re.sub(r"runs/\S+|<[^>]*>|\bRUN\b", str(run), plain)
-    name, *arguments = [word for word in shlex.split(plain) if word != "--help"]
+    name, *arguments = [word for word in shlex.split(plain) if word not in ("--help", "--help-all")]
     assert name in COMMANDS, f"{page}: there is no bidex-meta {name}"
     command = importlib.import_module(COMMANDS[name].module).main
     found = flags_of(command, arguments)

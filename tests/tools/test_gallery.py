@@ -9,6 +9,7 @@ import torch
 from bidex_meta.tasks import registry
 from bidex_meta.witness.replay import Replay
 from bidex_meta.witness.store import Witness
+from tests.pages import ROOT
 from tests.tasks.tables import SIZES
 from tools import gallery
 
@@ -31,6 +32,11 @@ def test_every_class_has_a_section_with_all_that_a_newcomer_asks() -> None:
         assert all(f"{component} " in section for component in task.variation_space.names)
         observation, action = SIZES[name, True]
         assert f"| observation, action | {observation}, {action} |" in section, name
+
+
+def test_page_of_the_repository_is_as_the_code_says() -> None:
+    """Run ``make gallery`` if this fails."""
+    assert (ROOT / "docs" / "tasks.md").read_text() == gallery.text()
 
 
 def test_pictures_are_written_where_the_page_looks_for_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -154,7 +154,7 @@ PRESETS: dict[str, FlashSACConfig] = {
     # instead of its 1,024. Log standard deviations (flash_rl/agents/flashSAC/layer.py) range from -10 to 2 and start in
     # the middle. The gradient has no limit (here a huge one), and observations are not normalised.
     "gpu": FlashSACConfig(
-        hidden=(128, 128, 128), critic_hidden=(256, 256, 256), replay_steps=2442, replay_memory=21.0, warmup_steps=25,
+        hidden=(128, 128, 128), critic_hidden=(256, 256, 256), replay_steps=2442, replay_memory=23.0, warmup_steps=25,
         updates_per_step=2, policy_delay=2, batch_size=2048, gamma=0.99, n_steps=3, tau=0.01, learning_rate=3e-4,
         critic_learning_rate=3e-4, alpha_learning_rate=3e-4, init_alpha=0.01, std_range=(4.54e-5, 7.39),
         init_std=0.0183, max_grad_norm=1e9, normalise_observations=False, atoms=101, value_bound=5.0, noise_repeats=16,
