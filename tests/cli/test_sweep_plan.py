@@ -7,7 +7,7 @@ import pytest
 from bidex_meta.cli.parsing import peek_all
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments.sweep_plan import PlannedRun, SweepPlan
-from tests.pages import ROOT
+from tests.pages import ROOT, blocks
 
 FILE = """
 name = "tiny"
@@ -160,3 +160,12 @@ def test_the_sweeps_of_the_repository_are_what_run_takes(tmp_path: Path, monkeyp
         if "seeds" in path.read_text():
             assert f"--run-dir=runs/{path.stem}/" in shown("sweep", path, "--dry-run")
     assert not (tmp_path / "runs").exists()
+
+
+def test_the_sweep_of_the_page_is_what_run_takes(tmp_path: Path, monkeypatch, shown) -> None:
+    monkeypatch.chdir(tmp_path)
+    (text,) = [block.text for block in blocks(ROOT / "docs" / "sweeps.md") if block.language == "toml"]
+    Path("mystudy.toml").write_text(text)
+    Path("own.toml").write_text((ROOT / "suites" / "MT1.toml").read_text())
+    found = shown("sweep", "mystudy.toml", "--dry-run")
+    assert found.count("--run-dir=runs/mystudy/") == 2 * 2 * 2 * 3 + 2 + 2 * 2 * 3
