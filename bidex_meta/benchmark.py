@@ -372,7 +372,7 @@ def _task_class(suite: Suite, entry: SuiteClass) -> TaskClass:
     try:
         moving = True if suite.base == "moving" else None
         if "moving_base" in entry.options:
-            raise BidexError(f'{entry.name}: options: expected no moving_base. Write base = "moving" or "own".')
+            raise BidexError(f'{entry.name}: options: expected no moving_base. Write base = "moving" or "alone".')
         task_class = registry.get(entry.class_name, moving, suite.touch, **entry.options)
         task_class.adopt(suite.rules)
         for task in entry.tasks:

@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 
 import pytest
@@ -91,6 +92,16 @@ def test_a_class_takes_its_options(tmp_path: Path) -> None:
     assert Benchmark(suite.file).task_classes()["PourWater"].water == 30  # type: ignore[attr-defined]
     with pytest.raises(BidexError, match=r"Unknown option of PourWater 'watr'\. Did you mean 'water'"):
         Benchmark(write(tmp_path, text.replace("water =", "watr =")))
+
+
+def test_a_refusal_names_values_that_the_file_takes(tmp_path: Path) -> None:
+    text = META.replace('split = "test"', 'split = "test"\noptions = { moving_base = true }')
+    with pytest.raises(BidexError, match="expected no moving_base") as raised:
+        Benchmark(write(tmp_path, text))
+    named = re.findall(r'"(\w+)"', str(raised.value))
+    assert len(named) == 2
+    for base in named:
+        assert load_suite(write(tmp_path, META.replace('base = "moving"', f'base = "{base}"'))).base == base
 
 
 @pytest.mark.parametrize(("name", "told"), [("crate", "Unknown object 'crate'"), ("missing.xml", "missing.xml")])
