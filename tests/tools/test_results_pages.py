@@ -14,7 +14,7 @@ from tests.tools import test_collect
 from tests.tools.test_collect import collect, evaluated
 from tools.pages.blocks import fill, filled_pages
 from tools.pages.studies import bars_figure, read_studies
-from tools.pages.tables import arms_table, best_table, classes_table
+from tools.pages.tables import arms_table, best_table, classes_table, mean_and_range
 from tools.pages.validity import read_validity, validity_table
 
 no_weights = test_collect.no_weights
@@ -178,3 +178,8 @@ def test_pictures_are_drawn_anew_where_the_data_changed(page: Path) -> None:
     changed = data(page) / "tiny.json"
     changed.write_text(changed.read_text().replace('"parameters": 12345', '"parameters": 12346', 1))
     assert fill(page, data(page), check=True) == written[:1]
+
+
+def test_a_range_has_no_negative_zero() -> None:
+    assert mean_and_range(np.array([-0.3, 0.2]), ".0f", " %") == "0 % (0 to 0)"
+    assert mean_and_range(np.array([-0.6, -0.2]), ".0f") == "0 (-1 to 0)"

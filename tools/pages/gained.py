@@ -83,7 +83,7 @@ def adaptation_table(study: Study) -> Iterator[str]:
     rows = []
     for name, found in success.items():
         shares = [mean_and_range(each, ".3g", " %") for each in found.T]
-        rows.append([name, f"{blind[name]:.1f} %", *shares, f"{found[:, -1].mean() - blind[name]:+.0f}"])
+        rows.append([name, f"{blind[name]:.1f} %", *shares, f"{found[:, -1].mean() - blind[name]:+z.0f}"])
     shots = ["before", *(f"after {number + 1}" for number in range(len(parts[0]) - 1))]
     return table(("class", "blind at best", *shots, "above blind"), rows)
 

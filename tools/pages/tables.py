@@ -45,6 +45,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
 
 def mean_and_range(values: np.ndarray, form: str = ".4g", unit: str = "") -> str:
     """Format values (seeds,) as their mean, followed by ``(minimum to maximum)`` if there are several seeds."""
+    form = f"z{form}"  # a small negative value is 0, not -0
     ends = f" ({values.min():{form}} to {values.max():{form}})" if len(values) > 1 else ""
     return f"{values.mean():{form}}{unit}{ends}"
 
