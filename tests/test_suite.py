@@ -95,7 +95,7 @@ def test_a_class_takes_its_options(tmp_path: Path) -> None:
 
 
 def test_a_refusal_names_values_that_the_file_takes(tmp_path: Path) -> None:
-    text = META.replace('split = "test"', 'split = "test"\noptions = { moving_base = true }')
+    text = META.replace('split = "test"', 'split = "test"\noptions = { moving_base = 1 }')
     with pytest.raises(BidexError, match="expected no moving_base") as raised:
         Benchmark(write(tmp_path, text))
     named = re.findall(r'"(\w+)"', str(raised.value))
